@@ -1,0 +1,1 @@
+"""Speed measurements: workloads, peers and timing. Run with ``python -m benchmarks.<name>``."""

@@ -1,0 +1,211 @@
+"""What is refused before anything is traced.
+
+Every function looks only at values that are known now (not at tracers), and every error names the
+argument, what was expected and what came.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ewif_jax.types import Gaussian, Measurement
+
+
+def known(x: Any) -> np.ndarray | None:
+    """`x` as a NumPy array if its value is known now, else None."""
+    return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
+
+
+def require(condition: Any, argument: str, expected: str, got: Any) -> None:
+    """Raises a ValueError naming `argument` unless `condition` holds."""
+    if not condition:
+        raise ValueError(f"{argument}: expected {expected}, got {got}")
+
+
+def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
+    """Refuses an array whose shape differs; a string in `expected` stands for any length."""
+    got = jnp.shape(x)
+    same = len(got) == len(expected) and all(
+        isinstance(e, str) or g == e for g, e in zip(got, expected, strict=True)
+    )
+    wanted = "(" + ", ".join(map(str, expected)) + ("," if len(expected) == 1 else "") + ")"
+    require(same, argument, f"shape {wanted}", f"shape {got}")
+
+
+def finite(argument: str, x: Any) -> None:
+    value = known(x)
+    if value is not None:
+        bad = np.argwhere(~np.isfinite(value))
+        require(bad.size == 0, argument, "finite numbers", _first(value, bad))
+
+
+def positive(argument: str, x: Any) -> Any:
+    """Refuses a value that is not positive; returns it."""
+    value = known(x)
+    if value is not None:
+        require(_is_numeric(value), argument, "a positive number", repr(x))
+        require(np.all(value > 0), argument, "a positive number", _plain(value))
+    return x
+
+
+def at_least(argument: str, x: Any, bound: float) -> Any:
+    """Refuses a value below `bound`; returns it."""
+    value = known(x)
+    if value is not None:
+        require(_is_numeric(value), argument, f"a number >= {bound}", repr(x))
+        require(np.all(value >= bound), argument, f"a number >= {bound}", _plain(value))
+    return x
+
+
+def whole(argument: str, x: Any, bound: int) -> int:
+    """Refuses anything but a Python integer >= `bound` (a size has to be known before tracing)."""
+    ok = isinstance(x, int | np.integer) and not isinstance(x, bool) and x >= bound
+    require(ok, argument, f"a whole number >= {bound}", repr(x))
+    return int(x)
+
+
+def psd(argument: str, x: Any, definite: bool = False) -> Any:
+    """Refuses a matrix that is not square, finite, symmetric and positive (semi)definite."""
+    value = known(x)
+    if value is None:
+        return x
+    kind = "positive definite" if definite else "positive semidefinite"
+    square = value.ndim == 2 and value.shape[0] == value.shape[1]
+    require(square, argument, "a square matrix", f"shape {value.shape}")
+    finite(argument, value)
+    value = value.astype(float)
+    scale = max(np.abs(value).max(initial=0.0), np.finfo(float).tiny)
+    skew = np.abs(value - value.T).max(initial=0.0)
+    require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")
+    smallest = np.linalg.eigvalsh((value + value.T) / 2).min(initial=np.inf)
+    good = smallest > 0 if definite else smallest >= -1e-6 * scale
+    require(good, argument, f"a {kind} matrix", f"smallest eigenvalue {smallest:.3g}")
+    return x
+
+
+def prior(prior: Gaussian | None, n: int | None = None) -> None:
+    """Refuses a prior with wrong shapes, numbers that are not finite, or a bad covariance."""
+    if prior is None:
+        return
+    ok = isinstance(prior, Gaussian)
+    require(ok, "prior", "a Gaussian(mean, cov) or None", type(prior).__name__)
+    shape("prior.mean", prior.mean, ("n" if n is None else n,))
+    n = jnp.shape(prior.mean)[0]
+    shape("prior.cov", prior.cov, (n, n))
+    finite("prior.mean", prior.mean)
+    psd("prior.cov", prior.cov)
+
+
+def needs_prior(prior: Gaussian | None, method: str) -> Gaussian:
+    """Refuses `prior=None` for a method that carries a covariance."""
+    require(
+        prior is not None,
+        "prior",
+        f"a Gaussian: {method} carries a covariance and cannot start from nothing "
+        "(ewif, information and limited_memory can)",
+        None,
+    )
+    assert prior is not None
+    return prior
+
+
+def needs_key(key: Any, method: str) -> Any:
+    """Refuses a missing PRNG key."""
+    require(key is not None, "key", f"a PRNG key (jax.random.key(0)): {method} draws noise", None)
+    return key
+
+
+def stream(measurements: Measurement, batched: bool = False) -> None:
+    """Refuses a stream that is empty, ragged, or whose known numbers are not usable.
+
+    A batch of streams has one more leading axis (runs); any field may leave it out when all runs
+    share that field.
+    """
+    ok = isinstance(measurements, Measurement)
+    require(ok, "measurements", "a Measurement", type(measurements).__name__)
+    time, value, sensor, mask = measurements
+    lead = ("R", "T") if batched else ("T",)
+
+    def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:
+        short = batched and jnp.ndim(x) == 1 + len(tail)
+        shape(argument, x, (*(("T",) if short else lead), *tail))
+
+    fits("measurements.value", value, ("m",))
+    steps, m = jnp.shape(value)[-2:]
+    require(steps > 0, "measurements", "at least one measurement", "an empty stream")
+    for argument, x, tail in (("time", time, ()), ("sensor", sensor, ()), ("mask", mask, (m,))):
+        fits(f"measurements.{argument}", x, tail)
+        length = jnp.shape(x)[jnp.ndim(x) - 1 - len(tail)]
+        require(length == steps, f"measurements.{argument}", f"{steps} arrivals", length)
+    require(jnp.asarray(mask).dtype == bool, "measurements.mask", "booleans", mask.dtype)
+    integer = jnp.issubdtype(jnp.asarray(sensor).dtype, jnp.integer)
+    require(integer, "measurements.sensor", "integers", sensor.dtype)
+    finite("measurements.time", time)
+    seen_value, seen_mask = known(value), known(mask)
+    if seen_value is not None and seen_mask is not None:
+        bad = np.argwhere(~np.isfinite(seen_value) & seen_mask)
+        require(
+            bad.size == 0,
+            "measurements.value",
+            "finite numbers where mask is True (mask out what is missing)",
+            _first(seen_value, bad) if bad.size else None,
+        )
+    seen_sensor = known(sensor)
+    if seen_sensor is not None:
+        require(seen_sensor.min() >= 0, "measurements.sensor", "indices >= 0", seen_sensor.min())
+
+
+def sensors(measurements: Measurement, count: int | None) -> None:
+    """Refuses known sensor indices outside 0..count-1."""
+    value = known(measurements.sensor)
+    if value is not None and count is not None:
+        require(
+            value.max() < count,
+            "measurements.sensor",
+            f"an index below {count} (the model has {count} sensor{'s' * (count != 1)})",
+            int(value.max()),
+        )
+
+
+def resolvable(times: Any, dtype: Any) -> None:
+    """Refuses known times that `dtype` cannot tell apart (epoch seconds in float32)."""
+    value = known(times)
+    if value is None or value.dtype.kind != "f" or value.size < 2:
+        return
+    rounded = value.astype(dtype).astype(value.dtype)
+    merged = (np.diff(value) != 0) & (np.diff(rounded) == 0)
+    require(
+        not merged.any(),
+        "measurements.time",
+        f"times that {np.dtype(dtype)} can tell apart (subtract the first time, or use float64)",
+        f"distinct times near {value.max():.17g} that round to the same number",
+    )
+
+
+def report_times(times: Any, steps: int) -> None:
+    """Refuses report times of the wrong length, not finite, or running backwards."""
+    shape("times", times, (steps,))
+    finite("times", times)
+    value = known(times)
+    if value is not None:
+        back = np.argwhere(np.diff(value) < 0)
+        got = None if not back.size else f"{value[back[0, 0] + 1]} after {value[back[0, 0]]}"
+        require(back.size == 0, "times", "report times that do not decrease", got)
+
+
+def _is_numeric(value: np.ndarray) -> bool:
+    return value.dtype.kind in "fiu"
+
+
+def _plain(value: np.ndarray) -> Any:
+    return value.item() if value.ndim == 0 else value.tolist()
+
+
+def _first(value: np.ndarray | Array, bad: np.ndarray) -> str:
+    if bad.size == 0:
+        return ""
+    index = tuple(int(i) for i in bad[0])
+    return f"{value[index]} at index {index if len(index) != 1 else index[0]}"

@@ -1,0 +1,217 @@
+"""Running an estimator: one arrival at a time (`step`) or a whole stream (`run`)."""
+
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
+
+Clock = Literal["validity", "arrival"]
+
+
+class Arrival(NamedTuple):
+    """What one arrival does: the state that goes on, the state to report from, and diagnostics."""
+
+    kept: Any
+    reported: Any
+    info: Info
+
+
+def advance(
+    estimator: Estimator, params: Any, state: Any, measurement: Measurement, to: Array | None = None
+) -> Arrival:
+    """Moves `state` to the measurement (or to the clock time `to`) and updates it.
+
+    With nothing in the measurement (mask all False) and no clock the filter stays where it is;
+    what is reported is its prediction.
+    """
+    measurement = cast(measurement, state.time.dtype)
+    target = jnp.maximum(state.time, measurement.time if to is None else to)
+    moved = estimator.predict(params, state, target)
+    updated, info = estimator.update(params, moved, measurement)
+    if to is not None:
+        return Arrival(updated, updated, info)
+    present = jnp.any(measurement.mask)
+    kept = jax.tree.map(lambda new, old: jnp.where(present, new, old), updated, state)
+    return Arrival(kept, updated, info)
+
+
+def step(
+    estimator: Estimator, params: Any, state: Any, measurement: Measurement
+) -> tuple[Any, Info]:
+    """The state after one arrival, and its diagnostics: the body of `run` as a streaming call.
+
+    The state moves to the measurement's time unless that is past (then the measurement is late).
+    A measurement whose mask is all False changes nothing.
+
+    Args:
+        estimator: any `Estimator`.
+        params: what its parameters are read from.
+        state: from `estimator.init` or an earlier `step`.
+        measurement: one arrival: time (), value (m,), sensor (), mask (m,).
+    """
+    arrival = advance(estimator, params, state, measurement)
+    return arrival.kept, arrival.info
+
+
+def run(
+    estimator: Estimator,
+    params: Any,
+    measurements: Measurement,
+    *,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any = None,
+    clock: Clock = "validity",
+    key: Any = None,
+) -> Trace:
+    """Estimates after each arrival of a stream.
+
+    Args:
+        estimator: any `Estimator`.
+        params: what its parameters are read from: any pytree, differentiable.
+        measurements: T arrivals in their order of arrival, stacked on axis 0.
+        prior: Gaussian at t0, or None for "unknown" where the estimator accepts it.
+        t0: time of the prior in seconds.
+        times: (T,) when to report after arrival k; default the running maximum of the measurement
+            times. Reporting propagates a copy and never moves the filter.
+        clock: "validity": the filter's time is the newest measurement's. "arrival": the filter
+            itself moves to times[k] before update k, so any older measurement is late.
+        key: PRNG key, for estimators that draw noise.
+
+    Returns:
+        A `Trace`: time (T,), mean (T, n), cov (T, n, n), info, final_state. The dtype is that of
+        `measurements.value`.
+
+    Raises:
+        ValueError: unusable streams, priors, times or keys, before anything is traced.
+    """
+    measurements = validated(estimator, params, measurements, prior, t0, times, clock, key)
+    return _run(estimator, params, measurements, prior, t0, times, clock, key)
+
+
+def validated(
+    estimator: Estimator,
+    params: Any,
+    measurements: Measurement,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any,
+    clock: str,
+    key: Any,
+) -> Measurement:
+    """The stream in one float dtype, after everything that can be known now has been checked."""
+    checks.stream(measurements)
+    checks.prior(prior)
+    checks.shape("t0", t0, ())
+    checks.finite("t0", t0)
+    checks.require(clock in ("validity", "arrival"), "clock", "'validity' or 'arrival'", clock)
+    needs_times = clock == "arrival" and times is None
+    checks.require(not needs_times, "times", "arrival times, since clock='arrival'", None)
+    dtype = float_dtype(measurements.value)
+    checks.resolvable(measurements.time, dtype)
+    if times is not None:
+        checks.report_times(times, jnp.shape(measurements.time)[0])
+    measurements = cast(measurements, dtype)
+
+    def first() -> Any:
+        state = initial(estimator, params, prior, t0, dtype, key)
+        one = jax.tree.map(lambda x: jnp.asarray(x)[0], measurements)
+        return advance(estimator, params, state, one, None if times is None else times[0])
+
+    jax.eval_shape(first)
+    return measurements
+
+
+def initial(
+    estimator: Estimator, params: Any, prior: Gaussian | None, t0: Any, dtype: Any, key: Any
+) -> Any:
+    """The estimator's first state, with prior and t0 in `dtype`."""
+    if prior is not None:
+        prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
+    return estimator.init(params, prior, jnp.asarray(t0, dtype), key)
+
+
+def float_dtype(x: Any) -> Any:
+    """The float dtype that `x` has, or would be promoted to."""
+    dtype = jnp.asarray(x).dtype
+    return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.asarray(0.0).dtype
+
+
+def cast(measurement: Measurement, dtype: Any) -> Measurement:
+    """The measurement with floats in `dtype`, int32 sensors, and zeros where nothing was seen."""
+    mask = jnp.asarray(measurement.mask, bool)
+    return Measurement(
+        jnp.asarray(measurement.time, dtype),
+        jnp.where(mask, jnp.asarray(measurement.value, dtype), 0),
+        jnp.asarray(measurement.sensor, jnp.int32),
+        mask,
+    )
+
+
+def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurement:
+    """A stream of measurements from plain arrays.
+
+    Args:
+        time: (T,) validity times in seconds, in order of arrival.
+        value: (T,) or (T, m) numbers; NaN means missing unless `mask` is given.
+        sensor: index or (T,) indices; default sensor 0.
+        mask: (T,) or (T, m) bool; default: where `value` is finite.
+    """
+    value = jnp.asarray(value)
+    value = value[:, None] if value.ndim == 1 else value
+    checks.shape("value", value, ("T", "m"))
+    dtype = float_dtype(value)
+    if mask is None:
+        mask = jnp.isfinite(value)
+    mask = jnp.asarray(mask, bool)
+    mask = jnp.broadcast_to(mask[:, None] if mask.ndim == 1 else mask, value.shape)
+    checks.shape("time", time, (value.shape[0],))
+    checks.resolvable(time, dtype)
+    sensor = jnp.broadcast_to(jnp.asarray(sensor, jnp.int32), value.shape[:1])
+    return Measurement(
+        jnp.asarray(time, dtype), jnp.where(mask, value, 0).astype(dtype), sensor, mask
+    )
+
+
+def verdict(late: Array, present: Array, late_status: Status = Status.TOO_LATE) -> Array:
+    """The status of an update that has nothing more to say than "late" and "present"."""
+    status = jnp.where(late, late_status, Status.USED)
+    return jnp.where(present, status, Status.MASKED).astype(jnp.int32)
+
+
+def choose(condition: Array, yes: Any, no: Any) -> Any:
+    """`yes` where the scalar `condition` holds, else `no`, for whole pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+@partial(jax.jit, static_argnames=("estimator", "clock"))
+def _run(
+    estimator: Estimator,
+    params: Any,
+    measurements: Measurement,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any,
+    clock: Clock,
+    key: Any,
+) -> Trace:
+    dtype = measurements.value.dtype
+    state = initial(estimator, params, prior, t0, dtype, key)
+    times = None if times is None else jnp.asarray(times, dtype)
+
+    def body(state: Any, arrival: tuple[Measurement, Array | None]) -> tuple[Any, tuple]:
+        measurement, time = arrival
+        moved = advance(estimator, params, state, measurement, time if clock == "arrival" else None)
+        shown = moved.reported
+        if time is not None and clock == "validity":
+            shown = estimator.predict(params, shown, time)
+        mean, cov = estimator.estimate(params, shown)
+        return moved.kept, (shown.time, mean, cov, moved.info)
+
+    state, (time, mean, cov, info) = lax.scan(body, state, (measurements, times))
+    return Trace(time, mean, cov, info, state)

@@ -1,0 +1,1 @@
+"""In-sequence filters, one published method per file."""

@@ -1,0 +1,55 @@
+"""Anderson's Kalman filter with exponential data weighting."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.forms.covariance import covariance_form
+from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.types import Estimator
+
+
+def fading(
+    model: Model, fading: Any = None, *, inflation: Callable[..., Array] | None = None
+) -> Estimator:
+    r"""The Kalman filter that weights the data of step k by :math:`\alpha^{2k}`.
+
+    .. math::
+        \hat\Pi(k) &= \alpha^2 F \Pi(k-1) F' + Q \quad (5\text{-}14) \\
+        K &= \hat\Pi H' (H \hat\Pi H' + R)^{-1} \quad (5\text{-}13) \\
+        \Pi(k) &= (I - K H) \hat\Pi (I - K H)' + K R K' \quad (5\text{-}15)
+
+    Anderson (1973), section 5, in the usual notation z = H x.
+
+    Args:
+        model: a linear `Model`.
+        fading: Anderson's alpha >= 1 for every move over a nonempty interval, whatever its length;
+            a number or a function of `params`.
+        inflation: instead, the factor alpha^2 of an interval, a function (params, t0, t1) -> ();
+            exp((t1 - t0) / tau) makes this filter the EWIF when Q = 0.
+
+    Reduces to: `kalman` for alpha = 1; `ewif` with a Gaussian prior for Q = 0 and inflation
+        exp((t1 - t0) / tau).
+
+    Deviations: after a very long gap the covariance saturates (largest variance = square root of
+        the largest float) instead of overflowing; new measurements then take over completely.
+
+    Raises:
+        ValueError: both or neither of `fading` and `inflation`; fading < 1.
+    """
+    need_linear(model, "fading")
+    both = (fading is None) == (inflation is None)
+    checks.require(not both, "fading", "one of `fading` and `inflation`", (fading, inflation))
+    if inflation is not None:
+        return covariance_form(model, "fading", inflation)
+    if not callable(fading):
+        checks.at_least("fading", fading, 1.0)
+
+    def per_step(params: Any, t0: Array, t1: Array) -> Array:
+        alpha = checks.at_least("fading", resolve(fading, params), 1.0)
+        return jnp.where(t1 > t0, jnp.square(alpha), 1)
+
+    return covariance_form(model, "fading", per_step)

@@ -1,0 +1,27 @@
+"""The Kalman filter in covariance form."""
+
+from ewif_jax.forms.covariance import covariance_form
+from ewif_jax.models.model import Model, need_linear
+from ewif_jax.types import Estimator
+
+
+def kalman(model: Model) -> Estimator:
+    r"""The Kalman filter of a linear model, Joseph-stabilised.
+
+    .. math::
+        \hat x^- &= F \hat x + b, \quad P^- = F P F' + Q \quad (28), (31) \\
+        \hat x &= \hat x^- + K (z - H \hat x^-), \quad K = P^- H' (H P^- H' + R)^{-1} \quad (30) \\
+        P &= (I - K H) P^- (I - K H)' + K R K'
+
+    after Shulami & Sigalov, section V-B. Q, P and R may be singular or zero. A late measurement is
+    not used (`TOO_LATE`): lift the filter with `replay`, or choose a method of `oosm`. Asked for a
+    time before its own it predicts NaN.
+
+    Args:
+        model: a linear `Model`; its parameters may be functions of `params`.
+
+    Raises:
+        ValueError: the model is not linear; `init` with `prior=None`.
+    """
+    need_linear(model, "kalman")
+    return covariance_form(model, "kalman")

@@ -1,0 +1,1 @@
+"""The two recursions that several published filters share, each written once."""

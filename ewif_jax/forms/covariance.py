@@ -1,0 +1,101 @@
+"""Covariance form: mean and covariance, moved through the model or its Jacobians."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.kernels import gaussian, symmetric
+from ewif_jax.models import Model, flow, sight
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+
+class CovarianceState(NamedTuple):
+    """time (), mean (n,), cov: the upper triangle of the covariance, row by row."""
+
+    time: Array
+    mean: Array
+    cov: Array
+
+
+def covariance_form(
+    model: Model, method: str, inflation: Callable[..., Array] | None = None
+) -> Estimator:
+    """The Kalman recursion with the model's matrices, or with its Jacobians at the mean.
+
+    `inflation(params, t0, t1)` multiplies F P F' before Q is added. It saturates where the largest
+    variance reaches the square root of the largest float, so that a long gap ends in "knows
+    nothing" instead of infinity.
+    """
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
+        del params, key
+        prior = checks.needs_prior(prior, method)
+        checks.prior(prior)
+        mean = jnp.asarray(prior.mean)
+        cov = symmetric.pack(jnp.asarray(prior.cov, mean.dtype))
+        return CovarianceState(jnp.asarray(t0, mean.dtype), mean, cov)
+
+    def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+        time = jnp.asarray(time, state.time.dtype)
+        ahead = jnp.maximum(time, state.time)
+        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+        checks.shape("F", F, (state.mean.shape[0],) * 2)
+        cov = symmetric.congruence(F, state.cov)
+        if inflation is not None:
+            cov = cov * _saturated(inflation(params, state.time, ahead), cov)
+        cov = cov + symmetric.pack(Q)
+        known = time >= state.time
+        return CovarianceState(time, jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan))
+
+    def update(
+        params: Any, state: CovarianceState, measurement: Measurement
+    ) -> tuple[CovarianceState, Info]:
+        late = measurement.time < state.time
+        present = jnp.any(measurement.mask)
+        mean, cov, info = measure(model, params, state.mean, state.cov, measurement)
+        updated = CovarianceState(state.time, mean, cov)
+        used = present & ~late
+        info = info._replace(
+            log_likelihood=jnp.where(used, info.log_likelihood, 0),
+            delay=state.time - measurement.time,
+            status=verdict(late, present),
+        )
+        return choose(used, updated, state), info
+
+    def estimate(params: Any, state: CovarianceState) -> Gaussian:
+        del params
+        return Gaussian(state.mean, symmetric.unpack(state.cov))
+
+    return Estimator(init, predict, update, estimate)
+
+
+def measure(
+    model: Model, params: Any, mean: Array, cov: Array, measurement: Measurement
+) -> tuple[Array, Array, Info]:
+    """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
+    (delay 0, status USED)."""
+    predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
+    checks.shape("measurement.value", measurement.value, (H.shape[0],))
+    checks.shape("H", H, ("m", mean.shape[0]))
+    checks.shape("R", R, (H.shape[0],) * 2)
+    difference = model.residual(measurement.value, predicted, measurement.sensor)
+    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, measurement.mask)
+    info = Info(
+        innovation.value,
+        innovation.cov,
+        gaussian.log_density(innovation, measurement.mask),
+        jnp.zeros((), mean.dtype),
+        jnp.zeros((), jnp.int32),
+    )
+    return mean, cov, info
+
+
+def _saturated(factor: Array, cov: Array) -> Array:
+    ceiling = jnp.sqrt(jnp.finfo(cov.dtype).max)
+    largest = jnp.max(jnp.abs(cov))
+    room = ceiling / jnp.where(largest > 0, largest, 1)
+    return jnp.minimum(jnp.asarray(factor, cov.dtype), jnp.maximum(room, 1))

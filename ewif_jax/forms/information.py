@@ -1,0 +1,163 @@
+"""Information form: an information matrix around a reference mean.
+
+The estimate is mean + matrix^-1 vector. Keeping the vector relative to a reference that follows
+the estimate (instead of the absolute matrix x mean) is what keeps float32 accurate, and a matrix
+that is still singular needs no special case.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels.small import fence, matmul, matvec
+from ewif_jax.models import Model
+from ewif_jax.models.model import affine_flow, observation, size
+from ewif_jax.types import Gaussian, Info, Measurement
+
+
+class InformationState(NamedTuple):
+    """time (), mean (n,): the reference, matrix: upper triangle of the information matrix,
+    vector (n,): information times (estimate - mean), zero as soon as the matrix has full rank."""
+
+    time: Array
+    mean: Array
+    matrix: Array
+    vector: Array
+
+
+def start(model: Model, params: Any, prior: Gaussian | None, t0: Any) -> InformationState:
+    """The state that knows the prior, or nothing."""
+    checks.prior(prior)
+    if prior is None:
+        t0 = jnp.asarray(t0)
+        t0 = t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
+        nothing = jnp.zeros(size(model, params, t0), t0.dtype)
+        return InformationState(t0, nothing, symmetric.pack(jnp.diag(nothing)), nothing)
+    checks.psd("prior.cov", prior.cov, definite=True)
+    mean = jnp.asarray(prior.mean)
+    matrix = cholesky.inverse(cholesky.factor(jnp.asarray(prior.cov, mean.dtype)))
+    return InformationState(
+        jnp.asarray(t0, mean.dtype), mean, symmetric.pack(matrix), jnp.zeros_like(mean)
+    )
+
+
+def transport(
+    model: Model, params: Any, state: InformationState, time: Array, weight: Array | float
+) -> InformationState:
+    """The state at `time` without process noise: information times `weight`, in either direction.
+
+    matrix <- weight A' matrix A and vector <- weight A' vector, with A from `time` back to the
+    state's time.
+    """
+    dtype = state.mean.dtype
+    F, c = affine_flow(model, params, state.time, time, dtype)
+    A, _ = affine_flow(model, params, time, state.time, dtype)
+    mean = matvec(F, state.mean)
+    return InformationState(
+        time,
+        mean if c is None else mean + c,
+        weight * symmetric.congruence(A.T, state.matrix),
+        weight * matvec(A.T, state.vector),
+    )
+
+
+def absorb(
+    model: Model,
+    params: Any,
+    state: InformationState,
+    measurement: Measurement,
+    weight: Array | float,
+) -> tuple[InformationState, Info]:
+    """The state with a measurement of any time, its information times `weight`; `Info.status` is
+    left at 0 for the caller to set."""
+    dtype = state.mean.dtype
+    mask = measurement.mask
+    A, c = affine_flow(model, params, state.time, measurement.time, dtype)
+    H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
+    checks.shape("measurement.value", measurement.value, (H.shape[0],))
+    checks.shape("H", H, ("m", state.mean.shape[0]))
+    checks.shape("R", R, (H.shape[0],) * 2)
+    there = matvec(A, state.mean)
+    there = there if c is None else there + c
+    difference = model.residual(measurement.value, matvec(H, there), measurement.sensor)
+    difference = jnp.where(mask, difference, 0)
+    seen = jnp.where(mask[:, None], matmul(H, A), 0)
+    noise = cholesky.factor(gaussian.mask_cov(R, mask))
+    white = fence(cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1)))
+    rows, target = white[:, :-1], white[:, -1]
+    n = state.mean.shape[0]
+    gained = jnp.concatenate([matvec(rows[:, i:].T, rows[:, i]) for i in range(n)])
+    updated = recentred(
+        InformationState(
+            state.time,
+            state.mean,
+            state.matrix + weight * gained,
+            state.vector + weight * matvec(rows.T, target),
+        )
+    )
+    return updated, _info(state, seen, difference, R, mask, measurement.time, weight)
+
+
+def recentred(state: InformationState) -> InformationState:
+    """The same information around the estimate, if there is one."""
+    f = factor(state.matrix)
+    shift = cholesky.solve(f, state.vector)
+    return state._replace(
+        mean=jnp.where(f.full_rank, state.mean + shift, state.mean),
+        vector=jnp.where(f.full_rank, 0, state.vector),
+    )
+
+
+def estimate(state: InformationState) -> Gaussian:
+    """Mean and covariance; NaN while the information matrix is not of full rank."""
+    f = factor(state.matrix)
+    mean = state.mean + cholesky.solve(f, state.vector)
+    return Gaussian(
+        jnp.where(f.full_rank, mean, jnp.nan),
+        jnp.where(f.full_rank, cholesky.inverse(f), jnp.nan),
+    )
+
+
+def factor(packed: Array) -> cholesky.Factor:
+    """The guarded factor of a packed information matrix; the identity's where it is singular, so
+    that whatever is computed from it and then discarded has a finite gradient."""
+    full = symmetric.unpack(packed)
+    f = cholesky.factor(full)
+    n = full.shape[0]
+    safe = f.full_rank
+    return cholesky.Factor(
+        jnp.where(safe, f.lower, jnp.eye(n, dtype=full.dtype)),
+        jnp.where(safe, f.reciprocal, 1),
+        safe,
+    )
+
+
+def _info(
+    state: InformationState,
+    seen: Array,
+    difference: Array,
+    R: Array,
+    mask: Array,
+    time: Array,
+    weight: Array | float,
+) -> Info:
+    f = factor(state.matrix)
+    root = cholesky.forward(f, seen.T)
+    innovation = gaussian.innovate(
+        difference - matvec(seen, cholesky.solve(f, state.vector)),
+        seen,
+        matmul(root.T, root) + R / weight,
+        mask,
+    )
+    known = f.full_rank
+    used = known & jnp.any(mask)
+    return Info(
+        jnp.where(known | ~mask, innovation.value, jnp.nan),
+        jnp.where(known, innovation.cov, jnp.nan),
+        jnp.where(used, gaussian.log_density(innovation, mask), 0),
+        state.time - time,
+        jnp.zeros((), jnp.int32),
+    )

@@ -1,0 +1,68 @@
+"""Products of small matrices that stay fast under `vmap`.
+
+XLA's CPU backend turns a batch of tiny matrix products into one scalar loop per matrix. Here a
+product whose other factor is shared by the batch becomes one large product, with the batch as its
+last (contiguous) axis, and a product of two batched factors becomes a sum of elementwise products.
+Both are exact rewritings; only the layout differs from `jnp.matmul`.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """`a @ b` for two matrices; under `vmap` the result is batched along its last axis."""
+    return _matmul_p.bind(a, b)
+
+
+def matvec(a: Array, x: Array) -> Array:
+    """`a @ x` for a matrix and a vector, with the batching of `matmul`."""
+    return matmul(a, x[:, None])[:, 0]
+
+
+def fence(x: Array) -> Array:
+    """`x`, computed once: a product with the identity, which XLA does not fuse into its users.
+
+    Without it XLA recomputes cheap-looking chains for every element that reads them.
+    """
+    rows = x.reshape(x.shape[0], -1)
+    return matmul(jnp.eye(x.shape[0], dtype=x.dtype), rows).reshape(x.shape)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return lax.dot(a, b, precision=lax.Precision.HIGHEST)
+
+
+def _abstract(a, b):
+    return jax.core.ShapedArray((a.shape[0], b.shape[1]), jnp.promote_types(a.dtype, b.dtype))
+
+
+def _batch(args, dims):
+    a, b = args
+    da, db = dims
+    if da is None:  # (i,k) . (k,j*R): one product, batch last
+        b = jnp.moveaxis(b, db, -1)
+        k, j, r = b.shape
+        return matmul(a, b.reshape(k, j * r)).reshape(a.shape[0], j, r), 2
+    a = jnp.moveaxis(a, da, -1)
+    if db is None:  # a.b = (I x b') vec(a): again one product without a transposition
+        i, k, r = a.shape
+        blocks = jnp.kron(jnp.eye(i, dtype=b.dtype), b.T)
+        return matmul(blocks, a.reshape(i * k, r)).reshape(i, b.shape[1], r), 2
+    b = jnp.moveaxis(b, db, -1)
+    return sum(a[:, k, None, :] * b[None, k, :, :] for k in range(a.shape[1])), 2
+
+
+_matmul_p = Primitive("small_matmul")
+_matmul_p.def_impl(jax.jit(_dot))
+_matmul_p.def_abstract_eval(_abstract)
+mlir.register_lowering(_matmul_p, mlir.lower_fun(_dot, multiple_results=False))
+ad.defbilinear(
+    _matmul_p,
+    lambda ct, a, b: matmul(ct, b.T),
+    lambda ct, a, b: matmul(a.T, ct),
+)
+batching.primitive_batchers[_matmul_p] = _batch

@@ -1,0 +1,89 @@
+"""The types every part of the package speaks: all are pytrees, their field names are the contract."""
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from jax import Array
+
+
+class Measurement(NamedTuple):
+    """One arrival. Stacked on axis 0 it is a stream, in the order of arrival.
+
+    time: () validity time in seconds (when the value was true, not when it arrived).
+    value: (m,) the measured numbers, in the units of the model's `observe`.
+    sensor: () int32, which sensor of the model.
+    mask: (m,) bool, which components exist; all False means that nothing arrived (padding).
+    """
+
+    time: Array
+    value: Array
+    sensor: Array
+    mask: Array
+
+
+class Gaussian(NamedTuple):
+    """mean (n,) and cov (n, n)."""
+
+    mean: Array
+    cov: Array
+
+
+class Status(IntEnum):
+    """What became of a measurement."""
+
+    USED = 0
+    """in sequence, used"""
+    LATE_USED = 1
+    """older than the state, used"""
+    TOO_LATE = 2
+    """older than the method can use: the estimate is unchanged"""
+    REJECTED = 3
+    """refused by a gate or because it would have broken the estimate: unchanged"""
+    MASKED = 4
+    """no component present: unchanged"""
+
+
+class Info(NamedTuple):
+    """Diagnostics of one update.
+
+    innovation: (m,) measured minus predicted; 0 in absent components.
+    innovation_cov: (m, m) its covariance before the update; identity rows for absent components.
+    log_likelihood: () log density of this measurement given the earlier ones; 0 if it was not used.
+    delay: () state time minus measurement time in seconds, positive when late.
+    status: () int32, a `Status`.
+    """
+
+    innovation: Array
+    innovation_cov: Array
+    log_likelihood: Array
+    delay: Array
+    status: Array
+
+
+class Estimator(NamedTuple):
+    """Four pure functions; every filter of the package, in sequence or not, is one.
+
+    init(params, prior, t0, key=None) -> state
+    predict(params, state, time) -> state at `time`
+    update(params, state, measurement) -> (state, Info); accepts measurement.time <= state.time
+    estimate(params, state) -> Gaussian
+
+    A state is a pytree with a field `time` and holds only what the next step needs.
+    """
+
+    init: Callable[..., Any]
+    predict: Callable[..., Any]
+    update: Callable[..., tuple[Any, Info]]
+    estimate: Callable[..., Gaussian]
+
+
+class Trace(NamedTuple):
+    """What `run` returns, stacked over arrivals: time (T,), mean (T, n), cov (T, n, n), info, and
+    the state after the last arrival (ready for `step`)."""
+
+    time: Array
+    mean: Array
+    cov: Array
+    info: Info
+    final_state: Any
