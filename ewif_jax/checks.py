@@ -158,16 +158,19 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
         require(seen_sensor.min() >= 0, "measurements.sensor", "indices >= 0", seen_sensor.min())
 
 
+def sensor(argument: str, index: int, count: int | None) -> None:
+    """Refuses a sensor index outside 0..count-1 (`count` None: no upper bound known)."""
+    require(index >= 0, argument, "an index >= 0", index)
+    if count is not None:
+        have = f"the model has {count} sensor{'s' * (count != 1)}"
+        require(index < count, argument, f"an index below {count} ({have})", index)
+
+
 def sensors(measurements: Measurement, count: int | None) -> None:
-    """Refuses known sensor indices outside 0..count-1."""
-    value = known(measurements.sensor)
-    if value is not None and count is not None:
-        require(
-            value.max() < count,
-            "measurements.sensor",
-            f"an index below {count} (the model has {count} sensor{'s' * (count != 1)})",
-            int(value.max()),
-        )
+    """Refuses a stream whose known sensor indices are not all below `count`."""
+    indices = known(measurements.sensor)
+    if indices is not None:
+        sensor("measurements.sensor", int(indices.max()), count)
 
 
 def resolvable(times: Any, dtype: Any) -> None:

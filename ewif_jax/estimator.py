@@ -5,6 +5,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
@@ -117,10 +118,13 @@ def validated(
     if times is not None:
         checks.report_times(times, jnp.shape(measurements.time)[0])
     measurements = cast(measurements, dtype)
+    sensors = checks.known(measurements.sensor)
 
     def first() -> Any:
         state = initial(estimator, params, prior, t0, dtype, key)
         one = jax.tree.map(lambda x: jnp.asarray(x)[0], measurements)
+        if sensors is not None:  # a known index is checked where the model is asked about it
+            one = one._replace(sensor=sensors.max())
         return advance(estimator, params, state, one, None if times is None else times[0])
 
     jax.eval_shape(first)
@@ -143,12 +147,14 @@ def float_dtype(x: Any) -> Any:
 
 
 def cast(measurement: Measurement, dtype: Any) -> Measurement:
-    """The measurement with floats in `dtype`, int32 sensors, and zeros where nothing was seen."""
+    """The measurement with floats in `dtype`, int32 sensors (left known where they are known), and
+    zeros where nothing was seen."""
     mask = jnp.asarray(measurement.mask, bool)
+    sensor = checks.known(measurement.sensor)
     return Measurement(
         jnp.asarray(measurement.time, dtype),
         jnp.where(mask, jnp.asarray(measurement.value, dtype), 0),
-        jnp.asarray(measurement.sensor, jnp.int32),
+        jnp.asarray(measurement.sensor, jnp.int32) if sensor is None else np.int32(sensor),
         mask,
     )
 

@@ -73,32 +73,27 @@ def absorb(
 ) -> tuple[InformationState, Info]:
     """The state with a measurement of any time, its information times `weight`; `Info.status` is
     left at 0 for the caller to set."""
-    dtype = state.mean.dtype
-    mask = measurement.mask
-    A, c = affine_flow(model, params, state.time, measurement.time, dtype)
-    H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
-    checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    checks.shape("H", H, ("m", state.mean.shape[0]))
-    checks.shape("R", R, (H.shape[0],) * 2)
-    there = matvec(A, state.mean)
-    there = there if c is None else there + c
-    difference = model.residual(measurement.value, matvec(H, there), measurement.sensor)
-    difference = jnp.where(mask, difference, 0)
-    seen = jnp.where(mask[:, None], matmul(H, A), 0)
-    noise = cholesky.factor(gaussian.mask_cov(R, mask))
-    white = fence(cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1)))
-    rows, target = white[:, :-1], white[:, -1]
-    n = state.mean.shape[0]
-    gained = jnp.concatenate([matvec(rows[:, i:].T, rows[:, i]) for i in range(n)])
+    seen, difference, R = _sight(model, params, state, measurement)
+    matrix, vector = _gained(seen, difference, R, measurement.mask)
     updated = recentred(
-        InformationState(
-            state.time,
-            state.mean,
-            state.matrix + weight * gained,
-            state.vector + weight * matvec(rows.T, target),
+        state._replace(
+            matrix=state.matrix + weight * matrix, vector=state.vector + weight * vector
         )
     )
-    return updated, _info(state, seen, difference, R, mask, measurement.time, weight)
+    return updated, _info(state, seen, difference, R, measurement, weight)
+
+
+def contribution(
+    model: Model, params: Any, state: InformationState, measurement: Measurement
+) -> tuple[Array, Array]:
+    """Packed information matrix and vector (around the reference) of one measurement alone."""
+    seen, difference, R = _sight(model, params, state, measurement)
+    return _gained(seen, difference, R, measurement.mask)
+
+
+def times(packed: Array, x: Array) -> Array:
+    """A packed matrix times a vector."""
+    return matvec(symmetric.unpack(packed), x)
 
 
 def recentred(state: InformationState) -> InformationState:
@@ -135,15 +130,42 @@ def factor(packed: Array) -> cholesky.Factor:
     )
 
 
+def _sight(
+    model: Model, params: Any, state: InformationState, measurement: Measurement
+) -> tuple[Array, Array, Array]:
+    """H A (m, n), measured minus predicted at the reference (m,), R (m, m); zeros where masked."""
+    dtype = state.mean.dtype
+    mask = measurement.mask
+    A, c = affine_flow(model, params, state.time, measurement.time, dtype)
+    H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
+    checks.shape("measurement.value", measurement.value, (H.shape[0],))
+    checks.shape("H", H, ("m", state.mean.shape[0]))
+    checks.shape("R", R, (H.shape[0],) * 2)
+    there = matvec(A, state.mean)
+    there = there if c is None else there + c
+    difference = model.residual(measurement.value, matvec(H, there), measurement.sensor)
+    seen = jnp.where(mask[:, None], matmul(H, A), 0)
+    return seen, jnp.where(mask, difference, 0), R
+
+
+def _gained(seen: Array, difference: Array, R: Array, mask: Array) -> tuple[Array, Array]:
+    noise = cholesky.factor(gaussian.mask_cov(R, mask))
+    white = fence(cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1)))
+    rows, target = white[:, :-1], white[:, -1]
+    n = seen.shape[1]
+    matrix = jnp.concatenate([matvec(rows[:, i:].T, rows[:, i]) for i in range(n)])
+    return matrix, matvec(rows.T, target)
+
+
 def _info(
     state: InformationState,
     seen: Array,
     difference: Array,
     R: Array,
-    mask: Array,
-    time: Array,
+    measurement: Measurement,
     weight: Array | float,
 ) -> Info:
+    mask = measurement.mask
     f = factor(state.matrix)
     root = cholesky.forward(f, seen.T)
     innovation = gaussian.innovate(
@@ -158,6 +180,6 @@ def _info(
         jnp.where(known | ~mask, innovation.value, jnp.nan),
         jnp.where(known, innovation.cov, jnp.nan),
         jnp.where(used, gaussian.log_density(innovation, mask), 0),
-        state.time - time,
+        state.time - measurement.time,
         jnp.zeros((), jnp.int32),
     )

@@ -10,6 +10,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.small import matvec
+from ewif_jax.models.sensor_range import check_sensor
 
 
 def resolve(value: Any, params: Any) -> Any:
@@ -73,7 +74,8 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
     functions of (t0, t1), or use `ewif_jax.models`.
 
     Raises:
-        ValueError: a constant has the wrong shape, or a constant Q or R is not PSD.
+        ValueError: a constant has the wrong shape, or a constant Q or R is not PSD; tables H and R
+            speak of different numbers of sensors.
     """
     n = None
     if not callable(F):
@@ -87,7 +89,7 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
         b = _over_one_interval(jnp.asarray(b))
     H, rows = _by_sensor("H", H)
     R, cols = _by_sensor("R", R)
-    sensors = max(rows, cols) if rows is not None and cols is not None else None
+    sensors = _count_sensors(rows, cols)
 
     def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
         matrix, offset = _affine(F, b, params, t0, t1, x.dtype)
@@ -142,6 +144,11 @@ def sight(
     model: Model, params: Any, x: Array, sensor: Array, t: Array
 ) -> tuple[Array, Array, Array]:
     """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
+
+    def seen(sensor: Any, params: Any, x: Array, t: Array) -> tuple[Array, Array]:
+        return model.observe(params, x, sensor, t), model.measurement_cov(params, sensor, t)
+
+    check_sensor(model.sensors, seen, sensor, params, x, t)
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     if model.linear is not None:
         H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
@@ -158,6 +165,11 @@ def observation(
 ) -> tuple[Array, Array]:
     """H (m, n) and R (m, m) of a linear model."""
     linear = need_linear(model, "this operation")
+
+    def seen(sensor: Any, params: Any, t: Array) -> tuple[Array, Array]:
+        return linear.H(params, sensor, t), model.measurement_cov(params, sensor, t)
+
+    check_sensor(model.sensors, seen, sensor, params, t)
     H = jnp.asarray(linear.H(params, sensor, t), dtype)
     return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
 
@@ -216,7 +228,8 @@ def _over_one_interval(value: Array) -> Callable[..., Array]:
 
 
 def _by_sensor(argument: str, x: Any) -> tuple[Callable[..., Array], int | None]:
-    """A function of (params, sensor, t), and the number of sensors it knows of."""
+    """A function of (params, sensor, t), and how many sensors it knows of: S of a table, 0 for a
+    matrix that all sensors share, None for a function."""
     if callable(x):
         return x, None
     table = jnp.asarray(x)
@@ -228,8 +241,17 @@ def _by_sensor(argument: str, x: Any) -> tuple[Callable[..., Array], int | None]
         for k, matrix in enumerate(np.asarray(x) if table.ndim == 3 else [x]):
             checks.psd("R" if table.ndim == 2 else f"R[{k}]", matrix)
     if table.ndim == 2:
-        return (lambda params, sensor, t: table), 1
+        return (lambda params, sensor, t: table), 0
     return (lambda params, sensor, t: select(table, sensor)), table.shape[0]
+
+
+def _count_sensors(rows: int | None, cols: int | None) -> int | None:
+    """How many sensors H and R speak of together; one matrix each is one sensor."""
+    tables = [count for count in (rows, cols) if count]
+    checks.require(
+        len(set(tables)) < 2, "R", f"as many sensors as H has ({rows})", f"{cols} sensors"
+    )
+    return tables[0] if tables else 1 if rows == cols == 0 else None
 
 
 def select(table: Array, index: Array) -> Array:

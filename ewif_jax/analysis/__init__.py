@@ -1,0 +1,1 @@
+"""What a filter is worth: merit of late data, bounds, actual errors, consistency, equivalences."""

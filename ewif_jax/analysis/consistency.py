@@ -1,0 +1,86 @@
+"""Errors of estimates, and whether their covariances are honest."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.special import gammainc
+
+from ewif_jax import checks
+from ewif_jax.kernels import cholesky
+from ewif_jax.types import Info
+
+
+def rmse(mean: Array, truth: Array, axis: int | tuple[int, ...] | None = None) -> Array:
+    r"""Root of the mean square distance, :math:`\sqrt{E \|\hat x - x\|^2}`, over `axis`.
+
+    Args:
+        mean: (..., n) estimates; only the first k components are compared.
+        truth: (..., k).
+        axis: axes of the leading dimensions to average over (default all).
+
+    Steps where the estimate is NaN (nothing known yet) are left out.
+    """
+    error = jnp.asarray(mean)[..., : jnp.shape(truth)[-1]] - jnp.asarray(truth)
+    known = jnp.all(jnp.isfinite(error), -1)
+    square = jnp.sum(jnp.square(jnp.where(known[..., None], error, 0)), -1)
+    count = jnp.sum(known, axis)
+    mean_square = jnp.sum(square, axis) / jnp.maximum(count, 1)
+    safe = jnp.where(mean_square > 0, mean_square, 1)
+    return jnp.where(mean_square > 0, jnp.sqrt(safe), jnp.where(count > 0, 0, jnp.nan))
+
+
+def nees(mean: Array, cov: Array, truth: Array) -> Array:
+    r"""Normalised estimation error squared :math:`(\hat x - x)' P^{-1} (\hat x - x)`, shape (...,).
+
+    Args:
+        mean: (..., n); cov: (..., n, n); truth: (..., k), compared with the first k components.
+
+    Chi-square with k degrees of freedom (mean k) if the filter is consistent.
+    """
+    k = jnp.shape(truth)[-1]
+    error = jnp.asarray(mean)[..., :k] - jnp.asarray(truth)
+    return _quadratic(error, jnp.asarray(cov)[..., :k, :k])
+
+
+def nis(info: Info) -> Array:
+    r"""Normalised innovation squared :math:`\nu' S^{-1} \nu`, shape (...,).
+
+    Chi-square with as many degrees of freedom as components were present; 0 where none was.
+    """
+    return _quadratic(info.innovation, info.innovation_cov)
+
+
+def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float]:
+    """Where the mean of `samples` independent chi-square(dof) values lies with probability `level`.
+
+    The usual two-sided acceptance band of average NEES or NIS.
+    """
+    checks.whole("dof", dof, 1)
+    checks.whole("samples", samples, 1)
+    checks.require(0 < level < 1, "level", "a probability between 0 and 1", level)
+    shape = dof * samples / 2
+    tail = (1 - level) / 2
+    return tuple(2 * _gamma_quantile(shape, p) / samples for p in (tail, 1 - tail))
+
+
+def _quadratic(error: Array, cov: Array) -> Array:
+    lead = error.shape[:-1]
+    flat = error.reshape(-1, error.shape[-1])
+    matrices = cov.reshape(-1, *cov.shape[-2:])
+
+    def one(error: Array, cov: Array) -> Array:
+        known = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(cov))
+        safe = jnp.where(known, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
+        white = cholesky.forward(cholesky.factor(safe), jnp.where(known, error, 0))
+        return jnp.where(known, white @ white, jnp.nan)
+
+    return jax.vmap(one)(flat, matrices).reshape(lead)
+
+
+def _gamma_quantile(shape: float, p: float) -> float:
+    low, high = 0.0, shape + 20 * np.sqrt(shape) + 20
+    for _ in range(200):
+        middle = (low + high) / 2
+        low, high = (middle, high) if float(gammainc(shape, middle)) < p else (low, middle)
+    return (low + high) / 2

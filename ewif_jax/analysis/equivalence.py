@@ -1,0 +1,177 @@
+"""Which decay time behaves like which process noise."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.analysis.expected import expected_mse
+from ewif_jax.estimator import run
+from ewif_jax.estimators.ewif import ewif
+from ewif_jax.estimators.information import information
+from ewif_jax.models.model import Model
+from ewif_jax.types import Estimator, Measurement
+
+
+class Case(NamedTuple):
+    """A known truth to compare filters on: the noise-free stream, truth (T, k), the noise
+    covariance as in `expected_mse`, and t0."""
+
+    measurements: Measurement
+    truth: Array
+    noise_cov: Any
+    t0: Any
+
+
+def steady_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: int) -> Array:
+    """The filter's gain (n, m) after `steps` equally spaced measurements of m components, started
+    from nothing: the derivative of the estimate by the last measurement."""
+    dtype = jnp.asarray(0.0).dtype
+    time = jnp.arange(1, steps + 1, dtype=dtype) * dt
+
+    def last(value: Array) -> Array:
+        values = jnp.zeros((steps, m), dtype).at[-1].set(value)
+        stream = Measurement(
+            time, values, jnp.zeros(steps, jnp.int32), jnp.ones((steps, m), bool)
+        )
+        return run(estimator, params, stream, prior=None, t0=jnp.zeros((), dtype)).mean[-1]
+
+    return jax.jacfwd(last)(jnp.zeros(m, dtype))
+
+
+def equivalent_tau(
+    model: Model,
+    params: Any = None,
+    *,
+    dt: float,
+    case: Case | None = None,
+    m: int = 1,
+    steps: int = 1000,
+    bounds: tuple[float, float] | None = None,
+) -> float:
+    r"""The tau in seconds with which the EWIF behaves like the Kalman filter of `model`.
+
+    By equal steady gain (the relative difference of the two gain matrices is least; for a scalar
+    random walk it vanishes at :math:`\tau = -\Delta t / \ln(1 - k)`), or, with a `case`, by equal
+    expected mean square error along its truth, at the root nearest to the one of equal gain.
+    Shulami & Sigalov, section V-C, ask for this tau.
+
+    Args:
+        model: linear, with the process noise in question.
+        params: its parameters.
+        dt: sampling interval in seconds.
+        case: where to compare expected errors; None compares steady gains.
+        m: number of measured components.
+        steps: arrivals until a gain counts as steady (many tau / dt).
+        bounds: search interval for tau in seconds; default (dt / 20, steps * dt / 10).
+    """
+    checks.positive("dt", dt)
+    low, high = bounds or (dt / 20, steps * dt / 10)
+    exponential = ewif(model, tau=lambda p: p[0])
+    noisy = information(model)
+    target = steady_gain(noisy, params, m, dt, steps)
+
+    def mismatch(tau: Array) -> Array:
+        gain = steady_gain(exponential, (tau, params), m, dt, steps)
+        return jnp.sum(jnp.square(gain / target - 1))
+
+    by_gain = _minimise(mismatch, low, high)
+    if case is None:
+        return by_gain
+    wanted = _mean_mse(noisy, params, case)
+    return _nearest_root(
+        lambda tau: _mean_mse(exponential, (tau, params), case) - wanted, low, high, by_gain
+    )
+
+
+def equivalent_process_noise(
+    model: Model,
+    tau: float,
+    *,
+    dt: float,
+    params_of: Callable[[Array], Any],
+    case: Case | None = None,
+    m: int = 1,
+    steps: int = 1000,
+    bounds: tuple[float, float] = (1e-6, 1e6),
+) -> float:
+    """The process noise with which the Kalman filter of `model` behaves like the EWIF with `tau`.
+
+    The inverse of `equivalent_tau`, by the same two criteria.
+
+    Args:
+        model: linear, its process noise a function of `params`.
+        tau: decay time in seconds.
+        dt: sampling interval in seconds.
+        params_of: the `params` of the model for a process-noise parameter q, e.g.
+            ``lambda q: {"q": q}``.
+        case, m, steps: as in `equivalent_tau`.
+        bounds: search interval for q.
+    """
+    checks.positive("dt", dt)
+    checks.positive("tau", tau)
+    low, high = bounds
+    exponential = ewif(model, tau=tau)
+    noisy = information(model)
+    some = params_of(jnp.asarray(low))
+    target = steady_gain(exponential, some, m, dt, steps)
+
+    def mismatch(q: Array) -> Array:
+        gain = steady_gain(noisy, params_of(q), m, dt, steps)
+        return jnp.sum(jnp.square(gain / target - 1))
+
+    by_gain = _minimise(mismatch, low, high)
+    if case is None:
+        return by_gain
+    wanted = _mean_mse(exponential, some, case)
+    return _nearest_root(
+        lambda q: _mean_mse(noisy, params_of(q), case) - wanted, low, high, by_gain
+    )
+
+
+def _mean_mse(estimator: Estimator, params: Any, case: Case) -> Array:
+    mse = expected_mse(
+        estimator,
+        params,
+        case.measurements,
+        case.truth,
+        noise_cov=case.noise_cov,
+        prior=None,
+        t0=case.t0,
+    )
+    return jnp.nanmean(mse)
+
+
+def _minimise(fn: Callable[[Array], Array], low: float, high: float) -> float:
+    """The minimiser in [low, high] by ever finer logarithmic grids, all points at once."""
+    evaluate = jax.jit(jax.vmap(fn))
+    a, b = np.log(low), np.log(high)
+    for _ in range(14):
+        grid = np.linspace(a, b, 33)
+        best = int(np.nanargmin(np.asarray(evaluate(jnp.exp(grid)))))
+        a, b = grid[max(best - 1, 0)], grid[min(best + 1, 32)]
+    return float(np.exp((a + b) / 2))
+
+
+def _nearest_root(
+    fn: Callable[[Array], Array], low: float, high: float, near: float
+) -> float:
+    """The root in [low, high] nearest to `near` on a log scale; NaN if there is none."""
+    evaluate = jax.jit(jax.vmap(fn))
+    grid = np.linspace(np.log(low), np.log(high), 129)
+    value = np.asarray(evaluate(jnp.exp(grid)))
+    crossing = np.flatnonzero(np.sign(value[:-1]) * np.sign(value[1:]) <= 0)
+    if crossing.size == 0:
+        return float("nan")
+    k = crossing[np.argmin(np.abs(grid[crossing] + grid[crossing + 1] - 2 * np.log(near)))]
+    a, b, sign = grid[k], grid[k + 1], np.sign(value[k])
+    for _ in range(9):
+        fine = np.linspace(a, b, 33)
+        value = np.asarray(evaluate(jnp.exp(fine)))
+        j = int(np.argmax(np.sign(value) != sign))
+        a, b = fine[max(j - 1, 0)], fine[j]
+    return float(np.exp((a + b) / 2))

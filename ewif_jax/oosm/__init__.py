@@ -1,0 +1,1 @@
+"""Late measurements: one published method per file."""

@@ -1,0 +1,34 @@
+"""A1: the exact update with a measurement that is one lag late."""
+
+from ewif_jax.models import Model
+from ewif_jax.oosm.history import one_step
+from ewif_jax.types import Estimator
+
+
+def a1(model: Model) -> Estimator:
+    r"""The Kalman filter that takes a measurement of the last interval exactly.
+
+    .. math::
+        \hat x(d|k) &= F(d, k) (\hat x(k|k) - \hat v) \quad (74), \qquad
+        \hat v = Q H' S^{-1} \nu = Q P(k|k-1)^{-1} (\hat x(k|k) - \hat x(k|k-1)) \quad (76) \\
+        P(d|k) &= F(d, k) (P(k|k) + P_{vv} - P_{xv} - P_{xv}') F(d, k)' \quad (79)
+
+    with (80), (81), Q = Q(k, d), :math:`t_{k-1} \le t_d \le t_k`: Bar-Shalom (2002) as in
+    Pornsarayouth & Yamakita, appendix. Older measurements are `TOO_LATE`. A nonlinear model is
+    linearised.
+
+    Args:
+        model: linear or not; it must allow motion back in time, and its process noise must compose
+            over parts of an interval.
+
+    Exact for a linear model and one late measurement per interval.
+
+    Reduces to: `kalman` (or `extended`) at delay 0; `al1` with lag 1.
+
+    Deviations: (76), (80) and (81) are written with the estimates at both ends of the interval, so
+        that several measurements at t_k, or late ones taken before, need not be remembered.
+
+    Raises:
+        ValueError: `init` with `prior=None`.
+    """
+    return one_step(model, "a1", 1, noise_estimated=True)

@@ -1,0 +1,44 @@
+"""Al1: the one-step solution for a late measurement several lags old."""
+
+from ewif_jax.models import Model
+from ewif_jax.oosm.history import one_step
+from ewif_jax.types import Estimator
+
+
+def al1(model: Model, lag: int) -> Estimator:
+    r"""The Kalman filter that takes a late measurement in one step over up to `lag` update times.
+
+    All the data since :math:`t_{k-l} \le t_d` count as one equivalent measurement of the present
+    state, from which the process noise since :math:`t_d` is estimated:
+
+    .. math::
+        \hat v = Q M^{-1} (\hat x(k|k) - \hat x(k|k-l)), \quad
+        P_{vv} = Q - Q (M^{-1} - M^{-1} P(k|k) M^{-1}) Q, \quad P_{xv} = P(k|k) M^{-1} Q
+
+    with Q = Q(k, d), M = P(k|k-l): Bar-Shalom, Chen & Mallick (2004) as in (71)-(86) of
+    Pornsarayouth & Yamakita. The cost does not depend on the delay. A nonlinear model is
+    linearised along the way, innovations go through `model.residual`.
+
+    Args:
+        model: linear or not; it must allow motion back in time, and its process noise must compose
+            over parts of an interval.
+        lag: how many past update times are kept, >= 1. A measurement older than all of them, or
+            than t0, is `TOO_LATE`.
+
+    At one lag the result is exact for a linear model, once per interval: a second late measurement
+    of the same interval meets a state that has already seen the first. At several lags the data
+    inside the lag are forgotten in the retrodiction: the covariance is optimistic, and the result
+    can be worse than dropping. It does not depend on the order of the late arrivals between two
+    moves of the filter.
+
+    Reduces to: `kalman` (or `extended`) at delay 0; `a1` for lag = 1; the exact answer for one late
+        measurement per interval, one lag old.
+
+    Deviations: (84)-(85) invert a matrix that is singular whenever fewer numbers than states were
+        measured since; here nothing but M is factored. (76) and (80) are written with the
+        equivalent measurement.
+
+    Raises:
+        ValueError: lag < 1; `init` with `prior=None`.
+    """
+    return one_step(model, "al1", lag, noise_estimated=True)

@@ -1,0 +1,33 @@
+"""Leaving late measurements out."""
+
+from typing import Any
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose
+from ewif_jax.oosm.history import too_late
+from ewif_jax.types import Estimator, Info, Measurement
+
+
+def drop_late(estimator: Estimator) -> Estimator:
+    """The estimator that uses a measurement only if it is not older than the state.
+
+    A late one leaves the state as it is, with status `TOO_LATE`: the baseline of every comparison
+    of methods (KF in Yoder et al., PFstd in Orguner & Gustafsson).
+
+    Args:
+        estimator: any `Estimator`; its states are used unchanged.
+
+    Reduces to: the estimator itself on a stream in order of validity time.
+
+    Raises:
+        ValueError: `estimator` is not an `Estimator`.
+    """
+    kind = type(estimator).__name__
+    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+
+    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+        late = measurement.time < state.time
+        updated, info = estimator.update(params, state, measurement)
+        return choose(late, state, updated), too_late(info, late)
+
+    return estimator._replace(update=update)

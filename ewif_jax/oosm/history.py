@@ -1,0 +1,155 @@
+"""What the one-step methods share: the estimates of the last update times, and the late update."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.forms.covariance import CovarianceState, covariance_form
+from ewif_jax.kernels import gaussian, retrodiction, symmetric
+from ewif_jax.kernels.small import fence, matmul, matvec
+from ewif_jax.models import Model, flow, sight
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+
+
+class HistoryState(NamedTuple):
+    """time (), mean (n,), cov (packed), used (): whether this time has taken a measurement, and
+    past: time (L,), mean (L, n), cov (L, packed) at the last L update times, newest first."""
+
+    time: Array
+    mean: Array
+    cov: Array
+    used: Array
+    past: CovarianceState
+
+
+def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Estimator:
+    r"""The one-step solution: a late measurement is one Kalman update of the present state.
+
+    With :math:`t_{k-l}` the last stored time before :math:`t_d`,
+    :math:`M = P(k|k-l)` and Q = Q(k, d), A = F(d, k),
+
+    .. math::
+        \hat z = h(A (\hat x - \hat v)), \quad \hat v = Q M^{-1} (\hat x - \hat x(k|k-l)) \\
+        \tilde H = H A (I - Q M^{-1}), \quad \tilde R = R + H A\, (Q - Q M^{-1} Q) A' H'
+
+    which is (71)-(86) of Pornsarayouth & Yamakita without the inverse of the singular R* of (84).
+    With `noise_estimated` False v is taken as zero and
+    :math:`\tilde R = R + H A\, (Q - Q M^{-1} P M^{-1} Q) A' H'`.
+
+    At delay 0 it is the plain update, so there is one code path, and its cost does not depend on
+    the delay.
+
+    The estimate of a time is stored when the filter leaves that time, with everything it had taken
+    until then, and is never rewritten: late arrivals between two moves all see the same history.
+    Times without a used measurement are not stored. The prior at t0 is the first entry.
+    """
+    checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
+    lag = checks.whole("lag", lag, 1)
+    form = covariance_form(model, method)
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> HistoryState:
+        first = form.init(params, prior, t0, key)
+        past = CovarianceState(*(jnp.stack([leaf] * lag) for leaf in first))
+        return HistoryState(*first, jnp.asarray(False), past)
+
+    def predict(params: Any, state: HistoryState, time: Array) -> HistoryState:
+        now = CovarianceState(*state[:3])
+        moved = form.predict(params, now, time)
+        left = moved.time > state.time
+        push = left & state.used
+        past = CovarianceState(
+            *(
+                jnp.where(push, jnp.concatenate([new[None], old[:-1]]), old)
+                for new, old in zip(now, state.past, strict=True)
+            )
+        )
+        return HistoryState(*moved, state.used & ~left, past)
+
+    def update(
+        params: Any, state: HistoryState, measurement: Measurement
+    ) -> tuple[HistoryState, Info]:
+        known, start = last_before(state.past, measurement.time)
+        mean, cov, info = late_update(model, params, state, start, measurement, noise_estimated)
+        updated = state._replace(mean=mean, cov=cov, used=jnp.asarray(True))
+        late = measurement.time < state.time
+        present = jnp.any(measurement.mask)
+        info = too_late(
+            info._replace(
+                delay=state.time - measurement.time,
+                status=verdict(late, present, Status.LATE_USED),
+            ),
+            ~known,
+        )
+        return choose(known & present, updated, state), info
+
+    def estimate(params: Any, state: HistoryState) -> Gaussian:
+        del params
+        return Gaussian(state.mean, symmetric.unpack(state.cov))
+
+    return Estimator(init, predict, update, estimate)
+
+
+def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceState]:
+    """Whether there is an entry not newer than `time`, and the newest such (else the oldest)."""
+    slots = past.time.shape[0]
+    newer = jnp.sum(past.time > time)
+    here = jnp.arange(slots) == jnp.minimum(newer, slots - 1)
+
+    def pick(table: Array) -> Array:
+        return jnp.sum(jnp.where(here.reshape(-1, *[1] * (table.ndim - 1)), table, 0), 0)
+
+    return newer < slots, CovarianceState(*(pick(leaf) for leaf in past))
+
+
+def late_update(
+    model: Model,
+    params: Any,
+    state: HistoryState,
+    start: CovarianceState,
+    measurement: Measurement,
+    noise_estimated: bool,
+) -> tuple[Array, Array, Info]:
+    """Mean and packed covariance of now after a measurement of a time between `start` and now."""
+    dtype = state.mean.dtype
+    at = jnp.clip(measurement.time, start.time, state.time)
+    predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
+    checks.shape("F", F, (state.mean.shape[0],) * 2)
+    M = symmetric.congruence(F, start.cov) + symmetric.pack(Q_all)
+    Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
+    gain, root = retrodiction.noise_gain(M, Q)
+    if noise_estimated:
+        origin = state.mean - matvec(gain, state.mean - predicted)
+        left_over = Q - matmul(root.T, root)
+    else:
+        origin = state.mean
+        left_over = Q - symmetric.unpack(symmetric.congruence(gain, state.cov))
+    there, back, _ = flow(model, params, origin, state.time, at)
+    value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+    checks.shape("measurement.value", measurement.value, (H.shape[0],))
+    seen = fence(matmul(H, back))
+    H_now = fence(seen - matmul(seen, gain))
+    R_now = fence(R + matmul(matmul(seen, left_over), seen.T))
+    difference = model.residual(measurement.value, value, measurement.sensor)
+    mean, cov, innovation = gaussian.update(
+        state.mean, state.cov, difference, H_now, R_now, measurement.mask
+    )
+    info = Info(
+        innovation.value,
+        innovation.cov,
+        gaussian.log_density(innovation, measurement.mask),
+        jnp.zeros((), dtype),
+        jnp.zeros((), jnp.int32),
+    )
+    return mean, cov, info
+
+
+def too_late(info: Info, refused: Array) -> Info:
+    """`info` of a measurement that was not used where `refused`: TOO_LATE, log likelihood 0."""
+    refused = refused & (info.status != Status.MASKED)
+    return info._replace(
+        log_likelihood=jnp.where(refused, 0, info.log_likelihood),
+        status=jnp.where(refused, jnp.int32(Status.TOO_LATE), info.status),
+    )

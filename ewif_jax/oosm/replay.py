@@ -1,0 +1,126 @@
+"""Exact use of late measurements: keep the last ones, put the new one in its place, filter again."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, step
+from ewif_jax.oosm.history import too_late
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+
+
+class ReplayState(NamedTuple):
+    """time (); current: the estimator's state with everything; base: its state before the buffered
+    measurements; buffer: L measurements sorted by time, values padded; evidence (): their joint log
+    likelihood given the base."""
+
+    time: Array
+    current: Any
+    base: Any
+    buffer: Measurement
+    evidence: Array
+
+
+def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
+    """The estimator as it would be had every measurement come in order of validity time.
+
+    The last `lag` measurements are kept, sorted, with the state before them. A new measurement is
+    put in its place (after those of the same time) and the buffer is filtered again, which costs
+    `lag` + 1 steps of the estimator for every measurement, late or not. This is the exact
+    reference for every other method, for estimators of any kind: a stochastic one repeats its
+    random numbers, because its key is part of the state before the buffer.
+
+    Args:
+        estimator: any `Estimator`.
+        lag: how many measurements are kept, >= 1. One older than the newest that has left the
+            buffer, or than t0, is `TOO_LATE`.
+        width: room for the components of one measurement.
+
+    `Info.innovation` and `innovation_cov` are those of the measurement in its place, given what is
+    older. `log_likelihood` is that given everything that arrived before: the change of the joint
+    log likelihood.
+
+    Reduces to: the estimator run on the stream sorted by validity time.
+
+    Raises:
+        ValueError: lag < 1; a measurement of more than `width` components.
+    """
+    kind = type(estimator).__name__
+    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    lag = checks.whole("lag", lag, 1)
+    width = checks.whole("width", width, 1)
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ReplayState:
+        first = estimator.init(params, prior, t0, key)
+        time = first.time
+        nothing = Measurement(
+            jnp.full(lag, time, time.dtype),
+            jnp.zeros((lag, width), time.dtype),
+            jnp.zeros(lag, jnp.int32),
+            jnp.zeros((lag, width), bool),
+        )
+        return ReplayState(time, first, first, nothing, jnp.zeros((), time.dtype))
+
+    def predict(params: Any, state: ReplayState, time: Array) -> ReplayState:
+        current = estimator.predict(params, state.current, time)
+        return state._replace(time=current.time, current=current)
+
+    def update(
+        params: Any, state: ReplayState, measurement: Measurement
+    ) -> tuple[ReplayState, Info]:
+        size = jnp.shape(measurement.value)[0]
+        checks.require(size <= width, "width", f"room for {size} components", width)
+        sorted_in, place = _insert(state.buffer, _padded(measurement, width))
+
+        def one(at: Any, entry: Measurement) -> tuple[Any, Info]:
+            cut = entry._replace(value=entry.value[:size], mask=entry.mask[:size])
+            return step(estimator, params, at, cut)
+
+        oldest, rest = (jax.tree.map(lambda x, k=k: x[k], sorted_in) for k in (0, slice(1, None)))
+        base, first = one(state.base, oldest)
+        last, others = lax.scan(one, base, rest)
+        ahead = state.time > last.time
+        current = choose(ahead, estimator.predict(params, last, state.time), last)
+        infos = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
+        total = jnp.sum(infos.log_likelihood).astype(state.evidence.dtype)
+        late = measurement.time < state.time
+        known = measurement.time >= state.base.time
+        info = jax.tree.map(lambda x: x[place], infos)
+        used_late = late & (info.status == Status.USED)
+        info = info._replace(
+            log_likelihood=total - state.evidence,
+            delay=state.time - measurement.time,
+            status=jnp.where(used_late, jnp.int32(Status.LATE_USED), info.status),
+        )
+        evidence = total - infos.log_likelihood[0]
+        updated = ReplayState(state.time, current, base, rest, evidence)
+        present = jnp.any(measurement.mask)
+        return choose(known & present, updated, state), too_late(info, ~known)
+
+    def estimate(params: Any, state: ReplayState) -> Gaussian:
+        return estimator.estimate(params, state.current)
+
+    return Estimator(init, predict, update, estimate)
+
+
+def _padded(measurement: Measurement, width: int) -> Measurement:
+    room = (0, width - measurement.value.shape[0])
+    return measurement._replace(
+        value=jnp.pad(measurement.value, room), mask=jnp.pad(measurement.mask, room)
+    )
+
+
+def _insert(buffer: Measurement, new: Measurement) -> tuple[Measurement, Array]:
+    """The buffer with `new` after everything not newer, and its place."""
+    place = jnp.sum(buffer.time <= new.time)
+    index = jnp.arange(buffer.time.shape[0] + 1)
+    source = jnp.where(index < place, index, index - 1)
+
+    def put(table: Array, row: Array) -> Array:
+        here = (index == place).reshape(-1, *[1] * (table.ndim - 1))
+        return jnp.where(here, row[None], table[jnp.clip(source, 0, table.shape[0] - 1)])
+
+    return jax.tree.map(put, buffer, new), place

@@ -1,0 +1,136 @@
+"""Weighted least squares over all the data at once: what the recursive filters must agree with."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.estimator import cast, float_dtype
+from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.kernels.triangular import triangularise
+from ewif_jax.models.model import Model, affine_flow, need_linear, observation
+from ewif_jax.types import Gaussian, Measurement
+
+Weight = Callable[[Any, Array, Array], Array]
+REPORTS_AT_ONCE = 64
+
+
+def batch_wls(
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    times: Any,
+    *,
+    weight: Weight,
+    prior: Gaussian | None = None,
+    t0: Any = None,
+) -> Gaussian:
+    r"""The weighted least-squares estimate at each report time, from all the measurements.
+
+    .. math::
+        \hat x_k &= P_k \sum_l A_{l,k}' H_l' W_{l,k} R_l^{-1} W_{l,k}' (y_l - H_l c_{l,k}) \quad (8)
+        \\
+        P_k &= \Big( \sum_l A_{l,k}' H_l' W_{l,k} R_l^{-1} W_{l,k}' H_l A_{l,k} \Big)^{-1} \quad (9)
+
+    Shulami & Sigalov, Theorems 1 and 2, with x_l = A x_k + c. Measurements before and after t_k
+    count alike, and any scalar weight will do: it need not be a semigroup (11c). Solved by
+    orthogonal triangularisation of the whitened rows and one step of refinement, so the condition
+    number is not squared.
+
+    Args:
+        model: a linear `Model`; its process noise is ignored.
+        params: what its parameters are read from; differentiable.
+        measurements: T measurements in any order.
+        times: (K,) seconds, when to estimate; any order.
+        weight: W(params, t_l, t_k) -> (), the *square root* of the factor on the information of
+            time t_l at time t_k. exp(-(t_k - t_l) / 2 tau) is the EWIF (12).
+        prior: a measurement of the whole state at t0, weighted like the others; or None.
+        t0: its time in seconds, needed with a prior.
+
+    Returns:
+        `Gaussian`: mean (K, n) and cov (K, n, n); NaN at times whose weighted measurements do not
+        determine the state. cov is (9), not the covariance of the error under model (3).
+
+    Raises:
+        ValueError: an unusable stream or prior, a prior without t0, a model that is not linear.
+
+    Reduces to: `ewif` at t_k = the newest time, for its weight; Savitzky-Golay for a polynomial
+        model and W = 1 inside a window (5).
+    """
+    need_linear(model, "batch_wls")
+    checks.stream(measurements)
+    checks.sensors(measurements, model.sensors)
+    checks.shape("times", times, ("K",))
+    checks.finite("times", times)
+    checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
+    dtype = float_dtype(measurements.value)
+    if prior is not None:
+        checks.prior(prior)
+        checks.psd("prior.cov", prior.cov, definite=True)
+        checks.require(t0 is not None, "t0", "the time of the prior", None)
+        t0 = jnp.asarray(t0, dtype)
+        prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
+    return _batch_wls(
+        model, params, cast(measurements, dtype), jnp.asarray(times, dtype), weight, prior, t0
+    )
+
+
+@partial(jax.jit, static_argnames=("model", "weight"))
+def _batch_wls(
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    times: Array,
+    weight: Weight,
+    prior: Gaussian | None,
+    t0: Any,
+) -> Gaussian:
+    dtype = times.dtype
+
+    def seen_from(time: Array, measurement: Measurement) -> Array:
+        """Whitened, weighted rows (m, n + 1) of one measurement: what it says of x(time), and
+        its value."""
+        H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
+        checks.shape("measurement.value", measurement.value, (H.shape[0],))
+        A, c = affine_flow(model, params, time, measurement.time, dtype)
+        known = jnp.zeros(H.shape[0], dtype) if c is None else H @ c
+        target = model.residual(measurement.value, known, measurement.sensor)
+        rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
+        noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
+        return weight(params, measurement.time, time) * cholesky.forward(noise, rows)
+
+    def believed_from(time: Array, prior: Gaussian) -> Array:
+        A, c = affine_flow(model, params, time, t0, dtype)
+        target = prior.mean if c is None else prior.mean - c
+        spread = cholesky.factor(prior.cov)
+        return weight(params, t0, time) * cholesky.forward(spread, jnp.c_[A, target])
+
+    def at(time: Array) -> Gaussian:
+        rows = jax.vmap(partial(seen_from, time))(measurements)
+        rows = rows.reshape(-1, rows.shape[-1])
+        if prior is not None:
+            rows = jnp.concatenate([rows, believed_from(time, prior)])
+        return _least_squares(rows[:, :-1], rows[:, -1])
+
+    return lax.map(at, times, batch_size=REPORTS_AT_ONCE)
+
+
+def _least_squares(rows: Array, target: Array) -> Gaussian:
+    """argmin |rows x - target|^2 and the inverse of rows'rows, NaN where that is singular."""
+    n = rows.shape[1]
+    lower = triangularise(jnp.c_[rows, target].T)
+    lower, turned = lower[:n, :n], lower[n, :n]
+    pivot, length = jnp.diag(lower), jnp.sqrt(jnp.sum(rows**2, 0))
+    full_rank = jnp.all(pivot > 8 * n * jnp.finfo(rows.dtype).eps * length)
+    lower = jnp.where(full_rank, lower, jnp.eye(n, dtype=rows.dtype))
+    f = cholesky.Factor(lower, 1 / jnp.diag(lower), full_rank)
+    mean = cholesky.backward(f, turned)
+    mean = mean + cholesky.solve(f, rows.T @ (target - rows @ mean))
+    return Gaussian(
+        jnp.where(full_rank, mean, jnp.nan),
+        jnp.where(full_rank, cholesky.inverse(f), jnp.nan),
+    )

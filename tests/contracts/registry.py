@@ -1,0 +1,102 @@
+"""One row per estimator: how to build it on the standard small model, and what it promises.
+
+A new estimator is one more row. `late` says what a late measurement becomes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import ewif_jax as ej
+from ewif_jax import Estimator, Gaussian, Measurement, Model, Status
+
+PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1}
+T0 = 0.0
+LAST = 4.0
+"""No time in the standard stream is later."""
+
+
+def small_model() -> Model:
+    """Two states, two sensors of two components, a known input; noise levels from `params`."""
+    table = jnp.asarray([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.5], [-0.3, 1.0]]])
+    noise = jnp.asarray([[[1.0, 0.2], [0.2, 0.5]], [[0.4, 0.0], [0.0, 2.0]]])
+
+    def F(params: Any, t0: Any, t1: Any) -> jax.Array:
+        dt = t1 - t0
+        return jnp.stack([jnp.stack([1.0 + 0 * dt, dt]), jnp.stack([0 * dt, 1.0 + 0 * dt])])
+
+    def Q(params: Any, t0: Any, t1: Any) -> jax.Array:
+        dt = t1 - t0
+        cross = dt**2 / 2
+        return params["q"] * jnp.stack(
+            [jnp.stack([dt**3 / 3, cross]), jnp.stack([cross, dt])]
+        )
+
+    def b(params: Any, t0: Any, t1: Any) -> jax.Array:
+        dt = t1 - t0
+        return 0.7 * jnp.stack([dt**2 / 2, dt])
+
+    return ej.linear_model(F, table, lambda p, s, t: p["r"] * noise[s], Q, b)
+
+
+class Row(NamedTuple):
+    """name; build(model) -> Estimator; late: the status of a late measurement;
+    accepts_no_prior; needs_key: draws random numbers; differentiable in `params`;
+    predicts_back: predict to an earlier time is a number, not NaN."""
+
+    name: str
+    build: Callable[[Model], Estimator]
+    late: Status = Status.TOO_LATE
+    accepts_no_prior: bool = False
+    needs_key: bool = False
+    differentiable: bool = True
+    predicts_back: bool = False
+
+
+def of(name: str) -> Callable[[Any], Any]:
+    """The parameter `name`, read from `params`."""
+    return lambda params: params[name]
+
+
+ROWS = (
+    Row("kalman", ej.kalman),
+    Row("information", ej.information, accepts_no_prior=True),
+    Row("square_root", ej.square_root),
+    Row("fading", lambda model: ej.fading(model, of("fading"))),
+    Row(
+        "ewif",
+        lambda model: ej.ewif(model, of("tau")),
+        late=Status.LATE_USED,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
+    Row("extended", ej.extended),
+)
+
+
+def standard_prior() -> Gaussian:
+    return Gaussian(np.array([0.4, -1.0]), np.array([[2.0, 0.3], [0.3, 0.5]]))
+
+
+def standard_stream(dtype: Any = np.float64) -> Measurement:
+    """Twelve arrivals: irregular, one repeated time, padding at 3, two late ones (6 and 9), and
+    partial masks."""
+    rng = np.random.default_rng(7)
+    time = np.array([0.3, 0.7, 1.0, 1.2, 1.2, 1.9, 1.5, 2.0, 2.6, 2.3, 3.1, 3.6])
+    mask = np.ones((12, 2), bool)
+    mask[3] = False
+    mask[[1, 8], 0] = False
+    mask[[5, 9], 1] = False
+    return Measurement(
+        jnp.asarray(time, dtype),
+        jnp.asarray(rng.normal(size=(12, 2)), dtype),
+        jnp.asarray(rng.integers(0, 2, 12), jnp.int32),
+        jnp.asarray(mask),
+    )
+
+
+LATE = (6, 9)
+PADDING = 3

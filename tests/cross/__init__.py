@@ -1,0 +1,1 @@
+"""The same numbers from other people's code."""

@@ -1,0 +1,1 @@
+"""What is true of the methods: one claim a file."""
