@@ -4,7 +4,7 @@ A model of the world (`linear_model`, `models`), an estimator (`ewif`, `kalman`,
 of measurements in arrival order go into `run`; `monte_carlo` and `tune` build on it.
 """
 
-from ewif_jax import models
+from ewif_jax import models, scenarios
 from ewif_jax.analysis.consistency import chi2_band, nees, nis, rmse
 from ewif_jax.analysis.equivalence import (
     Case,
@@ -23,7 +23,13 @@ from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.models import Model, linear_model
-from ewif_jax.monte_carlo import Scenario, Simulation, Statistics, monte_carlo
+from ewif_jax.monte_carlo import (
+    Scenario,
+    Simulation,
+    Statistics,
+    monte_carlo,
+    simulate_batch,
+)
 from ewif_jax.smoothers.batch_wls import batch_wls
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.tuning import (
@@ -82,6 +88,8 @@ __all__ = [
     "run",
     "run_batch",
     "savgol",
+    "scenarios",
+    "simulate_batch",
     "square_root",
     "steady_gain",
     "step",

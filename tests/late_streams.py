@@ -13,7 +13,7 @@ import ewif_jax as ej
 
 
 class Problem(NamedTuple):
-    """The same model for us (`model`, `prior`) and for the oracles (`oracle`); H and R by sensor."""
+    """The same model for us (`model`, `prior`) and the oracles (`oracle`); H and R by sensor."""
 
     model: ej.Model
     prior: ej.Gaussian

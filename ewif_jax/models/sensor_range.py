@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import checkify
 from jax.extend.core import jaxpr_as_fun
@@ -38,10 +37,11 @@ def _clamps(see: Callable[..., Any], index: int, inputs: tuple) -> bool:
 
     The checks are traced on their own first: they see nothing when traced in eager evaluation.
     """
-    checked = checkify.checkify(lambda s: see(s, *inputs), errors=checkify.index_checks)
-    jaxpr, shape = jax.make_jaxpr(lambda s: checked(s)[0], return_shape=True)(jnp.int32(0))
+    checked = checkify.checkify(see, errors=checkify.index_checks)
+    at = (np.int32(index), *inputs)
+    jaxpr, shape = jax.make_jaxpr(lambda *args: checked(*args)[0], return_shape=True)(*at)
     with jax.ensure_compile_time_eval():
-        error = jax.jit(jaxpr_as_fun(jaxpr))(np.int32(index))
+        error = jax.jit(jaxpr_as_fun(jaxpr))(*jax.tree.leaves(at))
     return jax.tree.unflatten(jax.tree.structure(shape), error).get() is not None
 
 

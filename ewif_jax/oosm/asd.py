@@ -85,9 +85,7 @@ def asd(model: Model, lag: int) -> Estimator:
             covs=jnp.where(known, moved.covs, jnp.nan),
         )
 
-    def update(
-        params: Any, state: JointState, measurement: Measurement
-    ) -> tuple[JointState, Info]:
+    def update(params: Any, state: JointState, measurement: Measurement) -> tuple[JointState, Info]:
         mask = measurement.mask
         newer = jnp.sum(state.times > measurement.time)
         known = newer < slots
@@ -100,9 +98,7 @@ def asd(model: Model, lag: int) -> Estimator:
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
         cross = jnp.einsum("ma,jab->jmb", H, here)
-        innovation = gaussian.innovate(
-            difference, _columns(cross), cross[at] @ H.T + R, mask
-        )
+        innovation = gaussian.innovate(difference, _columns(cross), cross[at] @ H.T + R, mask)
         gain = _blocks(gaussian.gain(innovation), slots)
         means = joint.means + gain @ innovation.value
         covs = _joseph(joint.covs, gain, innovation.cross, at, H, gaussian.mask_cov(R, mask))
@@ -125,9 +121,7 @@ def asd(model: Model, lag: int) -> Estimator:
     return Estimator(init, predict, update, estimate)
 
 
-def _with_time(
-    model: Model, params: Any, state: JointState, at: Array, time: Array
-) -> JointState:
+def _with_time(model: Model, params: Any, state: JointState, at: Array, time: Array) -> JointState:
     """The joint with a state of `time` in slot `at`, whose present state is the last not newer."""
     before, after = at, jnp.maximum(at - 1, 0)
     start, end = state.times[before], state.times[after]

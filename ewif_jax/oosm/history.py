@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -52,7 +53,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> HistoryState:
         first = form.init(params, prior, t0, key)
-        past = CovarianceState(*(jnp.stack([leaf] * lag) for leaf in first))
+        past = jax.tree.map(lambda leaf: jnp.stack([leaf] * lag), first)
         return HistoryState(*first, jnp.asarray(False), past)
 
     def predict(params: Any, state: HistoryState, time: Array) -> HistoryState:
@@ -60,11 +61,10 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
         moved = form.predict(params, now, time)
         left = moved.time > state.time
         push = left & state.used
-        past = CovarianceState(
-            *(
-                jnp.where(push, jnp.concatenate([new[None], old[:-1]]), old)
-                for new, old in zip(now, state.past, strict=True)
-            )
+        past = jax.tree.map(
+            lambda new, old: jnp.where(push, jnp.concatenate([new[None], old[:-1]]), old),
+            now,
+            state.past,
         )
         return HistoryState(*moved, state.used & ~left, past)
 
@@ -101,7 +101,7 @@ def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceSt
     def pick(table: Array) -> Array:
         return jnp.sum(jnp.where(here.reshape(-1, *[1] * (table.ndim - 1)), table, 0), 0)
 
-    return newer < slots, CovarianceState(*(pick(leaf) for leaf in past))
+    return newer < slots, jax.tree.map(pick, past)
 
 
 def late_update(

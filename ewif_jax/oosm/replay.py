@@ -1,4 +1,4 @@
-"""Exact use of late measurements: keep the last ones, put the new one in its place, filter again."""
+"""Exact use of late measurements: put each in its place among the last ones and filter again."""
 
 from typing import Any, NamedTuple
 

@@ -1,5 +1,6 @@
 """Savitzky-Golay coefficients, as the least squares of a polynomial model."""
 
+from functools import cache
 from math import factorial
 
 import jax
@@ -9,7 +10,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import stream
-from ewif_jax.models.model import linear_model
+from ewif_jax.models.model import Model, linear_model
 from ewif_jax.smoothers.batch_wls import batch_wls
 
 
@@ -59,14 +60,14 @@ def savgol(
     samples = stream(np.arange(window_length) - pos, jnp.zeros(window_length))
 
     def fitted(value: Array) -> Array:
-        window = samples._replace(value=value)
-        mean, _ = batch_wls(model, None, window, jnp.zeros(1), weight=_even)
-        return mean[0, deriv]
+        window = samples._replace(value=value[:, None])
+        return batch_wls(model, None, window, jnp.zeros(1), weight=_even).mean[0, deriv]
 
-    return jax.grad(fitted)(samples.value)[:, 0] / delta**deriv
+    return jax.vmap(fitted)(jnp.eye(window_length)) / delta**deriv
 
 
-def _polynomial(order: int):
+@cache
+def _polynomial(order: int) -> Model:
     """The state [value, first derivative, ...] of a polynomial, and a look at its value."""
     lift = np.arange(order + 1)[None, :] - np.arange(order + 1)[:, None]
     scale = np.where(lift >= 0, [[1 / factorial(max(k, 0)) for k in row] for row in lift], 0)

@@ -1,0 +1,44 @@
+# `make demo` and `make test` do everything on a machine that has Python >= 3.11 and make.
+PYTHON ?= python3
+BIN := .venv/bin
+STUDY := .venv/.study
+DEV := .venv/.dev
+
+.PHONY: demo test lint types check bench reproduce clean
+
+demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
+	$(BIN)/ewif-jax study sine --overwrite
+
+test: $(DEV)  ## all tests, on all cores
+	$(BIN)/python -m pytest -n auto
+
+lint: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(DEV)
+	$(BIN)/pyright
+
+check: lint types test
+
+reproduce: $(STUDY)  ## every published experiment at full size
+	$(BIN)/ewif-jax study all --overwrite
+
+bench: $(DEV)
+	$(BIN)/python -m pip install --quiet -e ".[bench]"
+	$(BIN)/python -m benchmarks.bench_linear
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed"'
+	$(PYTHON) -m venv .venv
+
+$(STUDY): $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet -e ".[study]"
+	touch $@
+
+$(DEV): $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet -e ".[dev]"
+	touch $@ $(STUDY)
+
+clean:
+	rm -rf .venv build dist results

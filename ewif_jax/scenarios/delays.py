@@ -1,0 +1,107 @@
+"""When things are measured and when they arrive: sampling, transport delay, loss."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import float_dtype
+from ewif_jax.types import Measurement
+
+
+class Delivery(NamedTuple):
+    """A stream as it arrives: measurements, arrival (T,) seconds, not decreasing, and order (T,):
+    which measurement of the input each arrival is. Lost ones are masked and keep their place."""
+
+    measurements: Measurement
+    arrival: Array
+    order: Array
+
+
+def regular_times(interval: Any, steps: int, start: Any = 0.0) -> Array:
+    """(T,) start, start + interval, ... in seconds."""
+    checks.positive("interval", interval)
+    steps = checks.whole("steps", steps, 1)
+    return start + interval * jnp.arange(steps)
+
+
+def poisson_times(key: Array, mean_interval: Any, steps: int, start: Any = 0.0) -> Array:
+    """(T,) the events of a Poisson process of rate 1 / mean_interval after `start`, seconds."""
+    checks.positive("mean_interval", mean_interval)
+    steps = checks.whole("steps", steps, 1)
+    return start + jnp.cumsum(mean_interval * jax.random.exponential(key, (steps,)))
+
+
+def exponential_delays(key: Array, mean: Any, steps: int) -> Array:
+    """(T,) exponentially distributed delays in seconds; `mean` may be () or (T,), zero included."""
+    checks.at_least("mean", mean, 0.0)
+    return mean * jax.random.exponential(key, (checks.whole("steps", steps, 1),))
+
+
+def uniform_delays(key: Array, low: Any, high: Any, steps: int) -> Array:
+    """(T,) delays uniform in [low, high), seconds; the bounds may be () or (T,)."""
+    checks.at_least("low", low, 0.0)
+    checks.at_least("high - low", jnp.asarray(high) - jnp.asarray(low), 0.0)
+    return low + (high - low) * jax.random.uniform(key, (checks.whole("steps", steps, 1),))
+
+
+def fixed_delays(delay: Any, steps: int) -> Array:
+    """(T,) the same delay for all, seconds; `delay` may be () or (T,)."""
+    checks.at_least("delay", delay, 0.0)
+    return jnp.broadcast_to(jnp.asarray(delay), (checks.whole("steps", steps, 1),))
+
+
+def by_sensor(table: Any, sensor: Array) -> Array:
+    """(T,) the entry of `table` (S,) that belongs to each measurement's sensor: per-sensor means,
+    bounds or delays for the functions above."""
+    checks.shape("table", table, ("S",))
+    return jnp.asarray(table)[sensor]
+
+
+def losses(key: Array, probability: Any, steps: int) -> Array:
+    """(T,) True for what never arrives, independently with `probability` () or (T,)."""
+    checks.at_least("probability", probability, 0.0)
+    return jax.random.bernoulli(key, probability, (checks.whole("steps", steps, 1),))
+
+
+def deliver(
+    time: Any, value: Any, delay: Any, *, sensor: Any = 0, lost: Any = None, mask: Any = None
+) -> Delivery:
+    """The measurements in their order of arrival, time + delay.
+
+    What arrives together arrives in the order given. A pure function of arrays, for use inside
+    `jit` and `vmap`.
+
+    Args:
+        time: (T,) validity times in seconds.
+        value: (T, m).
+        delay: () or (T,) seconds, >= 0.
+        sensor: () or (T,) indices.
+        lost: (T,) bool, what never arrives: it is masked.
+        mask: (T, m) bool, which components exist.
+
+    Reduces to: the same stream in its own order for delay 0 and increasing times.
+
+    Raises:
+        ValueError: wrong shapes; a negative delay.
+    """
+    value = jnp.asarray(value)
+    checks.shape("value", value, ("T", "m"))
+    steps = value.shape[0]
+    dtype = float_dtype(value)
+    time = jnp.asarray(time, dtype)
+    checks.shape("time", time, (steps,))
+    checks.at_least("delay", delay, 0.0)
+    sensor = jnp.broadcast_to(jnp.asarray(sensor, jnp.int32), (steps,))
+    mask = jnp.ones(value.shape, bool) if mask is None else jnp.asarray(mask)
+    checks.shape("mask", mask, value.shape)
+    if lost is not None:
+        checks.shape("lost", lost, (steps,))
+        mask = mask & ~jnp.asarray(lost)[:, None]
+    arrival = time + jnp.asarray(delay, dtype)
+    order = jnp.argsort(arrival, stable=True)
+    measurements = Measurement(time, value.astype(dtype), sensor, mask)
+    sorted_in = jax.tree.map(lambda x: x[order], measurements)
+    return Delivery(sorted_in, arrival[order], order)
