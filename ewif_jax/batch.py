@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.experimental.layout import Format, Layout
 from jax.extend.core import Literal
 from jax.sharding import Mesh, PartitionSpec
 
@@ -258,8 +259,7 @@ class Frozen:
         return isinstance(other, Frozen) and self._id == other._id
 
 
-@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices"))
-def _run_batch(
+def _batched(
     estimator: Estimator,
     inputs: Any,
     t0: Any,
@@ -298,6 +298,14 @@ def _run_batch(
     out = over_devices(filtered, input_flags, out_flags, devices)(inputs, keys)
     out = runs_first(out, out_flags, runs)
     return out if observe is not None else Trace(*out[0], out[1])
+
+
+_static = ("estimator", "flags", "clock", "observe", "devices")
+_run_batch = jax.jit(_batched, static_argnames=_static)
+# The result as it lies in memory, runs last: turning it around takes as long as filtering.
+_run_batch_in_place = jax.jit(
+    _batched, static_argnames=_static, out_shardings=Format(Layout.AUTO)
+)
 
 
 def _cast(measurements: Measurement, dtype: Any, flags: Measurement) -> Measurement:

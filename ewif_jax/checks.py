@@ -27,7 +27,7 @@ def require(condition: Any, argument: str, expected: str, got: Any) -> None:
 
 def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
     """Refuses an array whose shape differs; a string in `expected` stands for any length."""
-    got = jnp.shape(x)
+    got = np.shape(x)
     same = len(got) == len(expected) and all(
         isinstance(e, str) or g == e for g, e in zip(got, expected, strict=True)
     )
@@ -36,6 +36,7 @@ def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
 
 
 def finite(argument: str, x: Any) -> None:
+    """Refuses a known array with NaN or infinity in it."""
     value = known(x)
     if value is not None:
         bad = np.argwhere(~np.isfinite(value))
@@ -93,7 +94,7 @@ def prior(prior: Gaussian | None, n: int | None = None) -> None:
     ok = isinstance(prior, Gaussian)
     require(ok, "prior", "a Gaussian(mean, cov) or None", type(prior).__name__)
     shape("prior.mean", prior.mean, ("n" if n is None else n,))
-    n = jnp.shape(prior.mean)[0]
+    n = np.shape(prior.mean)[0]
     shape("prior.cov", prior.cov, (n, n))
     finite("prior.mean", prior.mean)
     psd("prior.cov", prior.cov)
@@ -130,15 +131,15 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     lead = ("R", "T") if batched else ("T",)
 
     def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:
-        short = batched and jnp.ndim(x) == 1 + len(tail)
+        short = batched and np.ndim(x) == 1 + len(tail)
         shape(argument, x, (*(("T",) if short else lead), *tail))
 
     fits("measurements.value", value, ("m",))
-    steps, m = jnp.shape(value)[-2:]
+    steps, m = np.shape(value)[-2:]
     require(steps > 0, "measurements", "at least one measurement", "an empty stream")
     for argument, x, tail in (("time", time, ()), ("sensor", sensor, ()), ("mask", mask, (m,))):
         fits(f"measurements.{argument}", x, tail)
-        length = jnp.shape(x)[jnp.ndim(x) - 1 - len(tail)]
+        length = np.shape(x)[np.ndim(x) - 1 - len(tail)]
         require(length == steps, f"measurements.{argument}", f"{steps} arrivals", length)
     require(jnp.asarray(mask).dtype == bool, "measurements.mask", "booleans", mask.dtype)
     integer = jnp.issubdtype(jnp.asarray(sensor).dtype, jnp.integer)

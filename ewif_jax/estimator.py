@@ -119,6 +119,8 @@ def validated(
         checks.report_times(times, jnp.shape(measurements.time)[0])
     measurements = cast(measurements, dtype)
     sensors = checks.known(measurements.sensor)
+    # A NumPy table among the parameters could not be indexed while tracing.
+    params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, params)
 
     def first() -> Any:
         state = initial(estimator, params, prior, t0, dtype, key)

@@ -170,7 +170,7 @@ def alpha_beta_eigenvalues(index: Any) -> Array:
     """
     alpha, beta = alpha_beta_gains(index)
     half = (alpha + beta) / 2
-    root = jnp.sqrt((half**2 - beta).astype(jnp.result_type(half, jnp.complex64)))
+    root = jnp.sqrt(lax.complex(half**2 - beta, jnp.zeros_like(beta)))
     return 1 - half + jnp.stack([root, -root])
 
 

@@ -20,6 +20,7 @@ def gain(P: Array, H: Array, R: Array) -> Array:
     return jnp.linalg.solve(H @ P @ H.T + R, H @ P).T
 
 
+@jax.jit
 def dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
     r"""The steady predicted covariance P (n, n) of a detectable system; NaN where there is none.
 

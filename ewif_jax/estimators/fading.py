@@ -34,8 +34,10 @@ def fading(
     Reduces to: `kalman` for alpha = 1; `ewif` with a Gaussian prior for Q = 0 and inflation
         exp((t1 - t0) / tau).
 
-    Deviations: after a very long gap the covariance saturates (largest variance = square root of
-        the largest float) instead of overflowing; new measurements then take over completely.
+    Deviations: over one interval the inflation is at most 1 / eps of the dtype (a gap of 16 tau in
+        float32, 36 tau in float64), and the largest variance at most the square root of the
+        largest float: a covariance cannot hold "nothing is known" and R at once. After a longer gap
+        the old estimate therefore fades while new data arrive; `ewif` forgets it at once.
 
     Raises:
         ValueError: both or neither of `fading` and `inflation`; fading < 1.

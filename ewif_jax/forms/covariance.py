@@ -26,9 +26,11 @@ def covariance_form(
 ) -> Estimator:
     """The Kalman recursion with the model's matrices, or with its Jacobians at the mean.
 
-    `inflation(params, t0, t1)` multiplies F P F' before Q is added. It saturates where the largest
-    variance reaches the square root of the largest float, so that a long gap ends in "knows
-    nothing" instead of infinity.
+    `inflation(params, t0, t1)` multiplies F P F' before Q is added. Over one interval it is at most
+    1 / eps: an old estimate then weighs less than rounding against the same amount of new data,
+    while anything larger would drown R in the rounding of P and leave a P that is not a covariance.
+    Over many intervals it saturates where the largest variance reaches the square root of the
+    largest float, so that "knows nothing" never becomes infinity.
     """
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
@@ -95,7 +97,8 @@ def measure(
 
 
 def _saturated(factor: Array, cov: Array) -> Array:
+    factor = jnp.minimum(jnp.asarray(factor, cov.dtype), 1 / jnp.finfo(cov.dtype).eps)
     ceiling = jnp.sqrt(jnp.finfo(cov.dtype).max)
     largest = jnp.max(jnp.abs(cov))
     room = ceiling / jnp.where(largest > 0, largest, 1)
-    return jnp.minimum(jnp.asarray(factor, cov.dtype), jnp.maximum(room, 1))
+    return jnp.minimum(factor, jnp.maximum(room, 1))

@@ -3,10 +3,12 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import fence, matmul, matvec
+from ewif_jax.kernels.batched import kernel
+from ewif_jax.kernels.small import matmul
 
 
 class Innovation(NamedTuple):
@@ -40,7 +42,7 @@ def log_density(innovation: Innovation, mask: Array) -> Array:
     white = cholesky.forward(innovation.factor, innovation.value)
     count = jnp.sum(mask).astype(white.dtype)
     half_log_det = cholesky.half_log_det(innovation.factor)
-    return -0.5 * (white @ white + count * jnp.log(2 * jnp.pi)) - half_log_det
+    return -0.5 * (jnp.sum(jnp.square(white)) + count * jnp.log(2 * jnp.pi)) - half_log_det
 
 
 def gain(innovation: Innovation) -> Array:
@@ -48,29 +50,47 @@ def gain(innovation: Innovation) -> Array:
     return cholesky.solve(innovation.factor, innovation.cross).T
 
 
-def joseph(packed: Array, gain: Array, cross: Array, H: Array, R: Array) -> Array:
-    """(I - K H) P (I - K H)' + K R K', packed, in two low-rank steps.
-
-    The second step uses H applied to the rounded result of the first, which is what makes the
-    Joseph form forget rounding errors of the gain.
-    """
-    n = gain.shape[0]
-    half = fence(symmetric.unpack(packed) - matmul(gain, cross))
-    correction = matmul(gain, R) - matmul(half, H.T)
-    return jnp.concatenate(
-        [half[i, i:] + matvec(gain[i:], correction[i]) for i in range(n)]
-    )
-
-
 def update(
     mean: Array, packed: Array, difference: Array, H: Array, R: Array, mask: Array
 ) -> tuple[Array, Array, Innovation]:
     """Mean and packed covariance after a linear(ised) measurement, with the innovation.
 
-    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,).
+    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,). The covariance is
+    (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
+    result of the first, which is what makes the Joseph form forget rounding errors of the gain.
     """
-    cross = matmul(H, symmetric.unpack(packed))
+    full = symmetric.unpack(packed)
+    cross = matmul(H, full)
     innovation = innovate(difference, cross, matmul(cross, H.T) + R, mask)
-    k = fence(gain(innovation))
-    mean = mean + matvec(k, innovation.value)
-    return mean, joseph(packed, k, innovation.cross, H, mask_cov(R, mask)), innovation
+    weights = cholesky.solve(innovation.factor, innovation.cross)
+    mean = _moved(mean, weights, innovation.value)
+    half = _reduced(full, innovation.cross, weights)
+    packed = _joseph(half, matmul(H, half), mask_cov(R, mask), weights)
+    return mean, packed, innovation
+
+
+@kernel
+def _moved(mean: Array, weights: Array, value: Array) -> Array:
+    """mean + K value, with K' = weights."""
+    return mean + _contract(weights, value[:, None])
+
+
+@kernel
+def _reduced(full: Array, cross: Array, weights: Array) -> Array:
+    """P - P H' K'."""
+    return full - _contract(cross[:, :, None], weights[:, None, :])
+
+
+@kernel
+def _joseph(half: Array, seen: Array, R: Array, weights: Array) -> Array:
+    """half + K (R K' - H half), packed; `seen` = H half."""
+    n = half.shape[0]
+    rows, cols = np.triu_indices(n)
+    correction = _contract(R[:, :, None], weights[:, None, :]) - seen
+    upper = half.reshape(n * n, *half.shape[2:])[rows * n + cols]
+    return upper + _contract(weights[:, rows], correction[:, cols])
+
+
+def _contract(a: Array, b: Array) -> Array:
+    """The sum of a b over their first axis."""
+    return sum(a[k] * b[k] for k in range(a.shape[0]))

@@ -12,6 +12,8 @@ from jax import Array, lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from ewif_jax.kernels.batched import stage
+
 
 def matmul(a: Array, b: Array) -> Array:
     """`a @ b` for two matrices; under `vmap` the result is batched along its last axis."""
@@ -53,7 +55,11 @@ def _batch(args, dims):
         blocks = jnp.kron(jnp.eye(i, dtype=b.dtype), b.T)
         return matmul(blocks, a.reshape(i * k, r)).reshape(i, b.shape[1], r), 2
     b = jnp.moveaxis(b, db, -1)
-    return sum(a[:, k, None, :] * b[None, k, :, :] for k in range(a.shape[1])), 2
+    return stage(_sum_of_products, a, b, batch=1), 2
+
+
+def _sum_of_products(a: Array, b: Array) -> Array:
+    return sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
 
 
 _matmul_p = Primitive("small_matmul")

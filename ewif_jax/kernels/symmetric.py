@@ -3,11 +3,13 @@
 What is stored this way is symmetric by construction, and its propagation is one matrix product.
 """
 
+from functools import cache
+
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.batched import kernel, linear_kernel, stage
 
 
 def order(packed: Array) -> int:
@@ -15,25 +17,80 @@ def order(packed: Array) -> int:
     return (int(np.sqrt(8 * packed.shape[0] + 1)) - 1) // 2
 
 
+@cache
+def places(n: int) -> np.ndarray:
+    """Where element (i, j) is stored, (n, n)."""
+    rows, cols = np.triu_indices(n)
+    where = np.zeros((n, n), int)
+    where[rows, cols] = where[cols, rows] = np.arange(rows.size)
+    return where
+
+
+def _pick(full: Array) -> Array:
+    n = full.shape[0]
+    rows, cols = np.triu_indices(n)
+    return full.reshape(n * n, *full.shape[2:])[rows * n + cols]
+
+
+def _fill(packed: Array) -> Array:
+    n = order(packed)
+    upper = jnp.asarray(np.triu(np.ones((n, n))), packed.dtype)
+    return _spread(packed) * upper.reshape(n, n, *(1,) * (packed.ndim - 1))
+
+
+def _spread(packed: Array) -> Array:
+    n = order(packed)
+    return packed[places(n).ravel()].reshape(n, n, *packed.shape[1:])
+
+
+def _gather(full: Array) -> Array:
+    n = full.shape[0]
+    rows, cols = np.triu_indices(n)
+    flat = full.reshape(n * n, *full.shape[2:])
+    twice = jnp.asarray(rows != cols, full.dtype).reshape(-1, *(1,) * (full.ndim - 2))
+    return flat[rows * n + cols] + twice * flat[cols * n + rows]
+
+
+_pack = linear_kernel(_pick, _fill)
+_unpack = linear_kernel(_spread, _gather)
+
+
 def pack(full: Array) -> Array:
     """The upper triangle (n (n + 1) / 2,) of a symmetric matrix (n, n)."""
-    return jnp.concatenate([full[i, i:] for i in range(full.shape[0])])
+    return _pack(full)
 
 
 def unpack(packed: Array) -> Array:
     """The symmetric matrix (n, n) of its packed upper triangle."""
-    n = order(packed)
-    rows, cols = np.triu_indices(n)
-    index = np.zeros((n, n), int)
-    index[rows, cols] = index[cols, rows] = np.arange(rows.size)
-    return jnp.stack([packed[k] for k in index.ravel()]).reshape(n, n)
+    return _unpack(packed)
 
 
 def congruence(a: Array, packed: Array) -> Array:
-    """a P a' for a square matrix a and a packed P, packed: one product with a's second power."""
-    n = a.shape[0]
+    """a P a' for a square matrix a and a packed P, packed.
+
+    With a shared by the batch this is one product with a's second power.
+    """
+    return _congruence(a, packed)
+
+
+@kernel
+def _congruence(a: Array, packed: Array) -> Array:
+    n, batch = a.shape[0], packed.ndim - 1
     rows, cols = np.triu_indices(n)
+    if a.size > n * n:
+        half = stage(_left, a, packed, batch=batch)
+        return sum(half[rows, k] * a[cols, k] for k in range(n))
+    flat = a.reshape(n * n)
+
+    def minor(i: np.ndarray, j: np.ndarray) -> Array:
+        return flat[i[:, None] * n + j[None, :]]
+
     twice = np.asarray(rows != cols, a.dtype)[None, :]
-    left, right = a[rows], a[cols]
-    power = left[:, rows] * right[:, cols] + twice * left[:, cols] * right[:, rows]
-    return matmul(power, packed[:, None])[:, 0]
+    power = minor(rows, rows) * minor(cols, cols) + twice * minor(rows, cols) * minor(cols, rows)
+    moved = lax.dot(power, packed.reshape(rows.size, -1), precision=lax.Precision.HIGHEST)
+    return moved.reshape(packed.shape)
+
+
+def _left(a: Array, packed: Array) -> Array:
+    full = _spread(packed)
+    return sum(a[:, k, None] * full[None, k] for k in range(a.shape[0]))

@@ -54,10 +54,10 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> HistoryState:
         first = form.init(params, prior, t0, key)
         past = jax.tree.map(lambda leaf: jnp.stack([leaf] * lag), first)
-        return HistoryState(*first, jnp.asarray(False), past)
+        return HistoryState(first.time, first.mean, first.cov, jnp.asarray(False), past)
 
     def predict(params: Any, state: HistoryState, time: Array) -> HistoryState:
-        now = CovarianceState(*state[:3])
+        now = CovarianceState(state.time, state.mean, state.cov)
         moved = form.predict(params, now, time)
         left = moved.time > state.time
         push = left & state.used
@@ -66,7 +66,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
             now,
             state.past,
         )
-        return HistoryState(*moved, state.used & ~left, past)
+        return HistoryState(moved.time, moved.mean, moved.cov, state.used & ~left, past)
 
     def update(
         params: Any, state: HistoryState, measurement: Measurement

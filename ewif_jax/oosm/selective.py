@@ -67,7 +67,7 @@ def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Est
             return choose(stale, state, updated), too_late(info, stale)
         width = checks.positive("softness", resolve(softness, params))
         weight = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
-        weight = weight.astype(state.mean.dtype)
+        weight = weight.astype(state.time.dtype)
         info = info._replace(log_likelihood=weight * info.log_likelihood)
         return _mixed(state, updated, weight), info
 

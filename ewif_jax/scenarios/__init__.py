@@ -1,5 +1,36 @@
 """Worlds to test filters in."""
 
+from ewif_jax.scenarios.arbitrary_target import (
+    arbitrary_noise,
+    arbitrary_path,
+    arbitrary_target,
+    arbitrary_target_model,
+)
+from ewif_jax.scenarios.arrowhead import (
+    arrowhead,
+    arrowhead_ekf,
+    arrowhead_ekf_model,
+    arrowhead_model,
+    arrowhead_path,
+    arrowhead_state,
+)
+from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
 
-__all__ = ["sine", "sine_model", "sine_signal"]
+__all__ = [
+    "arbitrary_noise",
+    "arbitrary_path",
+    "arbitrary_target",
+    "arbitrary_target_model",
+    "arrowhead",
+    "arrowhead_ekf",
+    "arrowhead_ekf_model",
+    "arrowhead_model",
+    "arrowhead_path",
+    "arrowhead_state",
+    "random_walk",
+    "random_walk_model",
+    "sine",
+    "sine_model",
+    "sine_signal",
+]

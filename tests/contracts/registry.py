@@ -12,8 +12,18 @@ import numpy as np
 
 import ewif_jax as ej
 from ewif_jax import Estimator, Gaussian, Measurement, Model, Status
+from ewif_jax.oosm.a1 import a1
+from ewif_jax.oosm.al1 import al1
+from ewif_jax.oosm.asd import asd
+from ewif_jax.oosm.b1 import b1
+from ewif_jax.oosm.bl1 import bl1
+from ewif_jax.oosm.drop_late import drop_late
+from ewif_jax.oosm.replay import replay
+from ewif_jax.oosm.selective import selective
+from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
 
-PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1}
+PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1, "window": 2.45, "max_delay": 0.77}
+LAG = 4
 T0 = 0.0
 LAST = 4.0
 """No time in the standard stream is later."""
@@ -44,16 +54,19 @@ def small_model() -> Model:
 
 class Row(NamedTuple):
     """name; build(model) -> Estimator; late: the status of a late measurement;
-    accepts_no_prior; needs_key: draws random numbers; differentiable in `params`;
-    predicts_back: predict to an earlier time is a number, not NaN."""
+    any_age: late measurements of any age are used; accepts_no_prior; needs_key: draws random
+    numbers; differentiable in `params`; predicts_back: predict to an earlier time is a number, not
+    NaN; refuses: who refuses a missing prior (default the name)."""
 
     name: str
     build: Callable[[Model], Estimator]
     late: Status = Status.TOO_LATE
+    any_age: bool = False
     accepts_no_prior: bool = False
     needs_key: bool = False
     differentiable: bool = True
     predicts_back: bool = False
+    refuses: str | None = None
 
 
 def of(name: str) -> Callable[[Any], Any]:
@@ -70,10 +83,50 @@ ROWS = (
         "ewif",
         lambda model: ej.ewif(model, of("tau")),
         late=Status.LATE_USED,
+        any_age=True,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
+    Row(
+        "limited_memory",
+        lambda model: ej.limited_memory(model, of("window"), 8),
+        late=Status.LATE_USED,
         accepts_no_prior=True,
         predicts_back=True,
     ),
     Row("extended", ej.extended),
+    Row("a1", a1, late=Status.LATE_USED),
+    Row("b1", b1, late=Status.LATE_USED),
+    Row("al1", lambda model: al1(model, LAG), late=Status.LATE_USED),
+    Row("bl1", lambda model: bl1(model, LAG), late=Status.LATE_USED),
+    Row("asd", lambda model: asd(model, LAG), late=Status.LATE_USED),
+    Row(
+        "replay",
+        lambda model: replay(ej.kalman(model), LAG),
+        late=Status.LATE_USED,
+        refuses="kalman",
+    ),
+    Row(
+        "selective",
+        lambda model: selective(al1(model, LAG), of("max_delay")),
+        late=Status.LATE_USED,
+        refuses="al1",
+    ),
+    Row(
+        "drop_late",
+        lambda model: drop_late(ej.ewif(model, of("tau"))),
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
+    Row("fixed_lag", lambda model: fixed_lag(model, 2)),
+    Row(
+        "fixed_lag_ewif",
+        lambda model: fixed_lag_ewif(model, of("tau"), lag=0.5),
+        late=Status.LATE_USED,
+        any_age=True,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
 )
 
 

@@ -218,19 +218,21 @@ def test_delay_zero_is_in_sequence(row):
 
 
 @each
-def test_what_is_too_late_changes_nothing(row):
+@pytest.mark.parametrize("age", [0.4, 7.0])
+def test_a_late_measurement_is_used_or_changes_nothing(row, age):
+    """7 s is before t0 and beyond any lag, window or maximal delay of the registry."""
     state = after(row, 6)
-    late = arrival(6)._replace(time=state.time - 0.4)
+    late = arrival(6)._replace(time=state.time - age)
     updated, info = built(row)[1](PARAMS, state, late)
-    assert info.status == row.late
-    np.testing.assert_allclose(info.delay, 0.4, rtol=1e-12)
+    used = row.late == Status.LATE_USED and (age < 1 or row.any_age)
+    assert info.status == (Status.LATE_USED if used else Status.TOO_LATE)
+    np.testing.assert_allclose(info.delay, age, rtol=1e-12)
     changed = any(
         not np.array_equal(numbers(a), numbers(b))
         for a, b in zip(jax.tree.leaves(updated), jax.tree.leaves(state), strict=True)
     )
-    assert changed == (row.late == Status.LATE_USED)
-    if row.late == Status.TOO_LATE:
-        assert info.log_likelihood == 0
+    assert changed == used
+    assert (info.log_likelihood != 0) == used
 
 
 @each
@@ -278,7 +280,7 @@ def test_info_has_the_shapes_and_statuses_it_documents(row):
 @each
 def test_a_missing_prior_is_refused_or_means_nothing_is_known(row):
     if not row.accepts_no_prior:
-        with pytest.raises(ValueError, match=rf"prior: expected a Gaussian: {row.name} .*None"):
+        with pytest.raises(ValueError, match=rf"prior: expected a Gaussian: {row.refuses or row.name} .*None"):
             traced(row, prior=None)
         return
     trace = traced(row, prior=None)

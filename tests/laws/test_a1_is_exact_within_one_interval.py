@@ -66,7 +66,7 @@ def test_a_nonlinear_model_that_happens_to_be_linear_gives_the_same():
 def test_nothing_is_inverted_that_may_be_singular():
     """No process noise, a certain prior, more states than numbers measured inside the lag."""
     still = ej.linear_model(F=lambda p, t0, t1: np.eye(3), H=np.eye(1, 3), R=np.eye(1))
-    data = ej.stream([1.0, 2.0, 1.5, 1.0, 0.0], np.arange(5.0))
+    data = ej.stream(np.array([1.0, 2.0, 1.5, 1.0, 0.0]), np.arange(5.0))
     certain = ej.Gaussian(np.zeros(3), np.zeros((3, 3)))
     for method in (a1(still), b1(still), al1(still, 3), bl1(still, 3)):
         trace = ej.run(method, None, data, prior=certain, t0=0.0)

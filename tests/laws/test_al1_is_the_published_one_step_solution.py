@@ -76,5 +76,5 @@ def test_late_arrivals_between_two_moves_commute():
         order[6:11] = np.random.default_rng(seed).permutation(order[6:11])
         moved = ej.Measurement(*(x[order] for x in data))
         trace = ej.run(al1(given.model, 6), None, moved, prior=given.prior, t0=0.0)
-        np.testing.assert_allclose(trace.mean[[10, 11]], plain.mean[[10, 11]], atol=1e-10)
-        np.testing.assert_allclose(trace.cov[[10, 11]], plain.cov[[10, 11]], atol=1e-10)
+        np.testing.assert_allclose(trace.mean[10:], plain.mean[10:], atol=1e-10)
+        np.testing.assert_allclose(trace.cov[10:], plain.cov[10:], atol=1e-10)

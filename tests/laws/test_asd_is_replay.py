@@ -14,10 +14,10 @@ def shuffled(rng, count):
     """Irregular times that arrive with exponential delays, one of them measured twice."""
     times = np.sort(rng.uniform(0.0, 5.0, count))
     times[count // 2] = times[count // 2 - 1]
-    return times[np.argsort(times + rng.exponential(0.8, count))]
+    return times[np.argsort(times + rng.exponential(1.5, count))]
 
 
-@pytest.mark.parametrize(("n", "m", "rank"), [(1, 1, None), (3, 2, 1), (6, 2, None)])
+@pytest.mark.parametrize(("n", "m", "rank"), [(1, 1, None), (4, 2, 2), (6, 2, None)])
 def test_asd_and_replay_are_exact(n, m, rank):
     given = problem(n, n, m, rank)
     rng = np.random.default_rng(n)
@@ -41,7 +41,7 @@ def test_asd_is_exact_for_all_that_it_accepts():
     data = stream(given, rng, shuffled(rng, 20))
     trace = ej.run(asd(given.model, 3), None, data, prior=given.prior, t0=0.0)
     used = np.asarray(trace.info.status) != ej.Status.TOO_LATE
-    assert 0 < (~used).sum() < 10
+    assert 0 < (~used).sum() < 12
     means, _ = exact(given, jax.tree.map(lambda x: x[used], data))
     np.testing.assert_allclose(trace.mean[used], means, atol=1e-8)
 
@@ -68,6 +68,6 @@ def test_log_likelihoods_add_up_to_the_joint_one():
     in_order = jax.tree.map(lambda x: x[np.argsort(data.time, kind="stable")], data)
     whole = ej.run(ej.kalman(given.model), None, in_order, prior=given.prior, t0=0.0)
     expected = np.sum(whole.info.log_likelihood)
-    for method in (asd(given.model, 12), replay(ej.kalman(given.model), 5)):
+    for method in (asd(given.model, 12), replay(ej.kalman(given.model), 12)):
         trace = ej.run(method, None, data, prior=given.prior, t0=0.0)
         np.testing.assert_allclose(np.sum(trace.info.log_likelihood), expected, rtol=1e-10)

@@ -85,11 +85,11 @@ def test_older_than_the_buffer_is_too_late():
 
 
 def test_replay_needs_room_for_the_measurement():
-    state = replay(ej.kalman(GIVEN.model), 2, width=1)
+    given = problem(1, 2, 2)
+    data = stream(given, np.random.default_rng(0), np.ones(1))
+    narrow = replay(ej.kalman(given.model), 2, width=1)
     with pytest.raises(ValueError, match="width: expected room for 2 components, got 1"):
-        ej.run(
-            state, None, stream(GIVEN, np.random.default_rng(0), [1.0]), prior=GIVEN.prior, t0=0.0
-        )
+        ej.run(narrow, None, data, prior=given.prior, t0=0.0)
     with pytest.raises(ValueError, match="lag"):
         replay(ej.kalman(GIVEN.model), 0)
     with pytest.raises(ValueError, match="estimator: expected an Estimator"):

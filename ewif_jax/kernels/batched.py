@@ -1,0 +1,197 @@
+"""Functions of small matrices that stay fast under `vmap` on a CPU.
+
+XLA's CPU backend turns a batch of small linear algebra into one scalar loop per matrix, puts the
+batch in front, and computes cheap-looking chains again for every element that reads them. A
+`kernel` is written for matrices on its leading axes and any batch axes behind them: `vmap` adds
+one more trailing (contiguous) axis, so that every operation is one long vector operation, and a
+batched kernel stays a function of its own in the compiled program, across which nothing is
+recomputed. Derivatives, of any order and in both modes, come from the function itself.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache, wraps
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+Function = Callable[..., Any]
+_ADJOINTS: dict[Function, Function] = {}
+
+
+def kernel(fn: Function) -> Function:
+    """`fn`, batched along trailing axes.
+
+    `fn` takes arrays and returns a float array, or a tuple of them. The trailing axes of its
+    arguments, equally many for all, are equal or 1: it must treat them elementwise.
+    """
+
+    @wraps(fn)
+    def call(*args: Any) -> Any:
+        out = _kernel_p.bind(*map(jnp.asarray, args), fn=fn, batch=0)
+        return tuple(out) if len(out) > 1 else out[0]
+
+    return call
+
+
+def linear_kernel(fn: Function, adjoint: Function) -> Function:
+    """The kernel of a linear function of one array whose adjoint is known."""
+    _ADJOINTS[fn], _ADJOINTS[adjoint] = adjoint, fn
+    return kernel(fn)
+
+
+def stage(fn: Function, *args: Array, batch: int) -> Any:
+    """`fn` of arrays with `batch` trailing axes, for use inside a kernel: what other parts of the
+    kernel read is computed once."""
+    out = _kernel_p.bind(*args, fn=fn, batch=batch)
+    return tuple(out) if len(out) > 1 else out[0]
+
+
+def _flat(fn: Function) -> Callable[..., Sequence[Array]]:
+    def call(*args: Array) -> Sequence[Array]:
+        out = fn(*args)
+        return out if isinstance(out, tuple) else (out,)
+
+    return call
+
+
+@cache
+def _jitted(fn: Function) -> Function:
+    def inside(*args: Array) -> Sequence[Array]:
+        with set_xla_metadata(inlineable=None):  # meant for the call only
+            return _flat(fn)(*args)
+
+    return jax.jit(inside)
+
+
+@cache
+def _outputs(fn: Function, avals: tuple[tuple[tuple[int, ...], Any], ...]) -> Sequence[Any]:
+    shapes = jax.eval_shape(_flat(fn), *(jax.ShapeDtypeStruct(*aval) for aval in avals))
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in shapes]
+
+
+def _abstract(*avals: Any, fn: Function, batch: int) -> Sequence[Any]:
+    return _outputs(fn, tuple((x.shape, x.dtype) for x in avals))
+
+
+def _inline(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
+    return _flat(fn)(*args)
+
+
+def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
+    if batch == 0:
+        return _flat(fn)(*args)
+    with set_xla_metadata(inlineable="false"):
+        return _jitted(fn)(*args)
+
+
+def _batch(args: Sequence[Array], dims: Sequence[Any], *, fn: Function, batch: int) -> Any:
+    runs = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+    args = [
+        x[..., None] if d is None else jnp.moveaxis(x, d, -1)
+        for x, d in zip(args, dims, strict=True)
+    ]
+    out = _kernel_p.bind(*args, fn=fn, batch=batch + 1)
+    shared = [x.shape[-1] != runs for x in out]
+    out = [x[..., 0] if s else x for x, s in zip(out, shared, strict=True)]
+    return out, [None if s else x.ndim - 1 for x, s in zip(out, shared, strict=True)]
+
+
+def _jvp(primals: Sequence[Array], tangents: Sequence[Any], *, fn: Function, batch: int) -> Any:
+    out = _kernel_p.bind(*primals, fn=fn, batch=batch)
+    live = tuple(not isinstance(t, ad.Zero) for t in tangents)
+    moved = [t for t in tangents if not isinstance(t, ad.Zero)]
+    if fn in _ADJOINTS:
+        return out, _kernel_p.bind(*moved, fn=fn, batch=batch)
+    return out, _kernel_p.bind(*primals, *moved, fn=_tangent(fn, live), batch=batch)
+
+
+@cache
+def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
+    """(primals, tangents of the live ones) -> tangents of the outputs."""
+
+    def tangent(*args: Array) -> tuple[Array, ...]:
+        primals, moved = args[: len(live)], args[len(live) :]
+        at = [x for x, moves in zip(primals, live, strict=True) if moves]
+        shapes = [jnp.broadcast_shapes(x.shape, t.shape) for x, t in zip(at, moved, strict=True)]
+        at, moved = (
+            [jnp.broadcast_to(x, s) for x, s in zip(xs, shapes, strict=True)] for xs in (at, moved)
+        )
+
+        def of(*at: Array) -> tuple[Array, ...]:
+            return tuple(_flat(fn)(*_merge(live, at, primals)))
+
+        return jax.jvp(of, tuple(at), tuple(moved))[1]
+
+    return tangent
+
+
+def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) -> Sequence[Any]:
+    linear = tuple(ad.is_undefined_primal(x) for x in args)
+    unknown = [x.aval for x in args if ad.is_undefined_primal(x)]
+    known = [x for x in args if not ad.is_undefined_primal(x)]
+    given = [ad.instantiate_zeros(ct) for ct in cotangents]
+    if fn in _ADJOINTS:
+        return _kernel_p.bind(*given, fn=_ADJOINTS[fn], batch=batch)
+    inner = tuple((x.shape[: x.ndim - batch], x.dtype) for x in unknown)
+    ranks = tuple(x.ndim - batch for x in (*known, *given))
+    out = _kernel_p.bind(*known, *given, fn=_adjoint(fn, linear, inner, ranks), batch=batch)
+    results = iter(
+        _summed(x, aval.shape) for x, aval in zip(out, unknown, strict=True)
+    )
+    return [next(results) if undefined else None for undefined in linear]
+
+
+@cache
+def _adjoint(
+    fn: Function,
+    linear: tuple[bool, ...],
+    inner: tuple[tuple[tuple[int, ...], Any], ...],
+    ranks: tuple[int, ...],
+) -> Function:
+    """(known arguments, cotangents of the outputs) -> cotangents of the linear arguments."""
+
+    def adjoint(*args: Array) -> tuple[Array, ...]:
+        count = linear.count(False)
+        known, given = args[:count], args[count:]
+        runs = jnp.broadcast_shapes(*(x.shape[r:] for x, r in zip(args, ranks, strict=True)))
+        unknown = [jax.ShapeDtypeStruct(shape + runs, dtype) for shape, dtype in inner]
+        fixed = tuple(not x for x in linear)
+
+        def of(*xs: Array) -> tuple[Array, ...]:
+            return tuple(_flat(fn)(*_merge(fixed, known, _merge(linear, xs, linear))))
+
+        given = tuple(
+            jnp.broadcast_to(x, x.shape[:r] + runs)
+            for x, r in zip(given, ranks[count:], strict=True)
+        )
+        return jax.linear_transpose(of, *unknown)(given)
+
+    return adjoint
+
+
+def _merge(chosen: Sequence[bool], some: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+    """`others` with the chosen places taken by `some`, in order."""
+    new = iter(some)
+    return [next(new) if c else x for c, x in zip(chosen, others, strict=True)]
+
+
+def _summed(x: Array, shape: tuple[int, ...]) -> Array:
+    """`x` summed over the axes that `shape` has not, or has as 1."""
+    axes = tuple(i for i, (a, b) in enumerate(zip(x.shape, shape, strict=True)) if a != b)
+    return jnp.sum(x, axes, keepdims=True) if axes else x
+
+
+_kernel_p = Primitive("kernel")
+_kernel_p.multiple_results = True
+_kernel_p.def_impl(lambda *args, fn, batch: _jitted(fn)(*args))
+_kernel_p.def_abstract_eval(_abstract)
+mlir.register_lowering(_kernel_p, mlir.lower_fun(_inline, multiple_results=True))
+mlir.register_lowering(_kernel_p, mlir.lower_fun(_apart, multiple_results=True), platform="cpu")
+batching.primitive_batchers[_kernel_p] = _batch
+ad.primitive_jvps[_kernel_p] = _jvp
+ad.primitive_transposes[_kernel_p] = _transpose

@@ -1,0 +1,184 @@
+"""The EWIF over one long series, parallel in time."""
+
+from collections.abc import Callable
+from functools import partial
+from math import isqrt
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.estimator import advance, initial, validated
+from ewif_jax.estimators.ewif import ewif
+from ewif_jax.forms import information as form
+from ewif_jax.forms import passage as way
+from ewif_jax.forms.information import InformationState
+from ewif_jax.forms.passage import Passage
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.types import Gaussian, Measurement, Trace
+
+Method = Literal["blocked", "associative"]
+Stretch = tuple[InformationState, Passage]
+
+
+def run_parallel(
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    *,
+    tau: Any = None,
+    weight: Callable[..., Array] | None = None,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any = None,
+    method: Method = "blocked",
+    block: int | None = None,
+) -> Trace:
+    r"""What `run` gives for `ewif`, computed for all parts of the series at once.
+
+    .. math::
+        P_k^{-1} = \sum_{l \le k} W_{l,k}^2 A_{l,k}' H_l' R_l^{-1} H_l A_{l,k} \quad (9)
+
+    Without process noise (Shulami & Sigalov, eqs. (18)-(19)) the information is a decayed sum over
+    the arrivals. The series is cut into blocks; all blocks are filtered at once from nothing, the
+    information carried into each block follows from these sums without any inverse, and all blocks
+    are filtered again from what was carried in. Irregular times, masks, late measurements, inputs
+    and gradients are those of `ewif`.
+
+    Args:
+        model, tau, weight: as in `ewif`.
+        params, measurements, prior, t0, times: as in `run`.
+        method: how information is carried across the blocks. "blocked": one block after the other
+            (CPU). "associative": a parallel prefix sum (accelerators).
+        block: arrivals per block; default the square root of their number, or 1 for "associative".
+
+    Returns:
+        The `Trace` of `run`, to rounding. With "associative" and very short blocks float32 loses
+        digits where the state is far from zero: take longer blocks or float64 there.
+
+    Raises:
+        ValueError: as `ewif` and `run`; an unknown method; block < 1.
+
+    Reduces to: `run(ewif(model, tau), ...)`.
+    """
+    known = method in ("blocked", "associative")
+    checks.require(known, "method", "'blocked' or 'associative'", repr(method))
+    estimator = ewif(model, tau, weight=weight)
+    measurements = validated(estimator, params, measurements, prior, t0, times, "validity", None)
+    steps = measurements.value.shape[0]
+    if block is None:
+        block = isqrt(steps - 1) + 1 if method == "blocked" else 1
+    block = min(checks.whole("block", block, 1), steps)
+    by_params, constant = (tau, None) if callable(tau) else (None, tau)
+    return _run_parallel(
+        model, by_params, weight, method, block, params, constant, measurements, prior, t0, times
+    )
+
+
+@partial(jax.jit, static_argnames=("model", "by_params", "weight", "method", "block"))
+def _run_parallel(
+    model: Model,
+    by_params: Callable[..., Array] | None,
+    weight: Callable[..., Array] | None,
+    method: Method,
+    block: int,
+    params: Any,
+    constant: Any,
+    measurements: Measurement,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any,
+) -> Trace:
+    tau = constant if by_params is None else by_params
+    estimator = ewif(model, tau, weight=weight)
+    steps, dtype = measurements.value.shape[0], measurements.value.dtype
+    start = initial(estimator, params, prior, t0, dtype, None)
+    times = None if times is None else jnp.asarray(times, dtype)
+    blocks = -(-steps // block)
+    padded = jax.tree.map(partial(_padded, to=blocks * block), (measurements, times))
+    absent = (jnp.arange(blocks * block) >= steps)[:, None]
+    measurements = padded[0]._replace(mask=padded[0].mask & ~absent)
+    cut = partial(_blocks_last, blocks=blocks)
+    arrivals, reports = jax.tree.map(cut, (measurements, padded[1]))
+
+    def squared(params: Any, t_from: Array, t_to: Array) -> Array:
+        if weight is not None:
+            return jnp.square(weight(params, t_from, t_to))
+        return jnp.exp((t_from - t_to) / resolve(tau, params))
+
+    def from_nothing(time: Array) -> Stretch:
+        return form.start(model, params, None, time), way.standstill(start.mean.shape[0], dtype)
+
+    def lengthen(stretch: Stretch, measurement: Measurement) -> Stretch:
+        state, passed = stretch
+        kept = advance(estimator, params, state, measurement).kept
+        leg = way.passage(model, params, squared, state.time, kept.time, dtype)
+        return kept, way.then(passed, leg)
+
+    def after(state: InformationState, stretch: Stretch) -> InformationState:
+        own, passed = stretch
+        return form.recentred(way.joined(way.carried(state, passed, own.time), own))
+
+    def filtered(state: InformationState, arrival: tuple[Measurement, Any]) -> tuple[Any, Any]:
+        measurement, time = arrival
+        moved = advance(estimator, params, state, measurement)
+        shown = moved.reported
+        if time is not None:
+            shown = estimator.predict(params, shown, time)
+        mean, cov = estimator.estimate(params, shown)
+        return moved.kept, (shown.time, mean, cov, moved.info)
+
+    def all_blocks(fn: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.vmap(fn, in_axes=-1, out_axes=-1)
+
+    seen = jnp.where(jnp.any(measurements.mask, 1), measurements.time, start.time)
+    newest = lax.cummax(jnp.maximum(seen, start.time))[block - 1 : -1 : block]
+    empty = all_blocks(from_nothing)(jnp.concatenate([start.time[None], newest]))
+    stretches, _ = lax.scan(lambda s, m: (all_blocks(lengthen)(s, m), None), empty, arrivals)
+    stretches = jax.tree.map(_leading, stretches)
+    carried_in = jax.tree.map(_trailing, _carried_in(start, stretches, after, method))
+    final, trace = lax.scan(all_blocks(filtered), carried_in, (arrivals, reports))
+    trace = jax.tree.map(lambda x: _joined_blocks(x)[:steps], trace)
+    return Trace(*trace, jax.tree.map(lambda x: x[..., -1], final))
+
+
+def _carried_in(
+    start: InformationState, stretches: Stretch, after: Callable[..., Any], method: Method
+) -> InformationState:
+    """What is known before each block, blocks first."""
+    if method == "blocked":
+        return lax.scan(lambda state, s: (after(state, s), state), start, stretches)[1]
+
+    def together(first: Stretch, second: Stretch) -> Stretch:
+        return after(first[0], second), way.then(first[1], second[1])
+
+    nothing_before = start, way.standstill(start.mean.shape[0], start.mean.dtype)
+    links = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), nothing_before, stretches)
+    return lax.associative_scan(jax.vmap(together), links)[0]
+
+
+def _padded(x: Array, to: int) -> Array:
+    """(T, ...) lengthened to (to, ...) with its last entry."""
+    last = jnp.broadcast_to(x[-1:], (to - x.shape[0], *x.shape[1:]))
+    return jnp.concatenate([jnp.asarray(x), last])
+
+
+def _blocks_last(x: Array, blocks: int) -> Array:
+    """(blocks L, ...) as (L, ..., blocks)."""
+    return _trailing(x.reshape(blocks, -1, *x.shape[1:]))
+
+
+def _joined_blocks(x: Array) -> Array:
+    """(L, ..., blocks) as (blocks L, ...)."""
+    first = _leading(x)
+    return first.reshape(-1, *first.shape[2:])
+
+
+def _trailing(x: Array) -> Array:
+    return jnp.moveaxis(x, 0, -1)
+
+
+def _leading(x: Array) -> Array:
+    return jnp.moveaxis(x, -1, 0)

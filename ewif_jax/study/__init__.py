@@ -1,0 +1,1 @@
+"""Experiments: a registry of studies, results that describe themselves, and the command line."""

@@ -1,0 +1,29 @@
+"""The look of all figures."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+TRUTH, MEASURED = "#222222", "#9aa7b8"
+EWIF, KALMAN, OTHER = "#1b7837", "#c51b7d", "#2166ac"
+
+
+def canvas(
+    rows: int = 1, columns: int = 1, *, width: float = 10, height: float = 4, **options: Any
+):
+    """A figure and its axes (an array unless there is one), with quiet grids and no frame lines."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, **options)
+    for one in np.ravel(axes):
+        one.grid(alpha=0.25, linewidth=0.6)
+        one.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def label(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Names of the axes, with units, and a title at the left."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.set_title(title, loc="left", fontsize="medium")

@@ -1,0 +1,249 @@
+"""The sine experiment of Shulami & Sigalov, section V-C and Fig. 1, and its optimum by gradient."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jax import Array
+
+from ewif_jax.analysis.equivalence import Case, equivalent_tau
+from ewif_jax.analysis.expected import expected_mse
+from ewif_jax.analysis.merit import random_walk_gain
+from ewif_jax.estimator import run as run_filter
+from ewif_jax.estimator import stream
+from ewif_jax.estimators.ewif import ewif
+from ewif_jax.estimators.information import information
+from ewif_jax.monte_carlo import monte_carlo, simulate_batch
+from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
+from ewif_jax.study import sine_figures
+from ewif_jax.study.experiment import Experiment, Measured
+from ewif_jax.study.folder import Arrays
+from ewif_jax.tuning import rmse_loss, tune
+from ewif_jax.types import Estimator
+
+DT, VARIANCE = 0.1, 0.5
+SETTINGS = ("published", "tuned on samples", "exact optimum")
+
+
+class Filter(NamedTuple):
+    """One of the two filters: its parameter, the published value and RMSE, where the gradient
+    starts from, and the range of the curve."""
+
+    name: str
+    estimator: Estimator
+    parameter: str
+    unit: str
+    published: float
+    printed: float
+    starts: tuple[float, float]
+    span: tuple[float, float]
+
+
+def filters() -> tuple[Filter, Filter]:
+    """The EWIF, and the Kalman filter that the first sample starts."""
+    model = sine_model(VARIANCE)
+    exponential = ewif(model, tau=lambda p: p["tau"])
+    kalman = information(model)
+    return (
+        Filter("EWIF", exponential, "tau", "s", 0.5, 0.31, (0.05, 5.0), (0.05, 5.0)),
+        Filter("KF", kalman, "sigma_w", "m", 0.1, 0.33, (0.01, 1.0), (0.02, 1.0)),
+    )
+
+
+def case() -> Case:
+    """The noise-free sine, for exact expected errors."""
+    time, truth = sine_signal(dt=DT)
+    return Case(stream(time, truth), truth, VARIANCE, 0.0)
+
+
+def exact_rmse(one: Filter) -> Callable[[Array], Array]:
+    """Parameter value -> root of the exact expected mean square error over time."""
+    at = case()
+
+    def rmse(value: Array) -> Array:
+        params, noise = {one.parameter: value}, at.noise_cov
+        mse = expected_mse(
+            one.estimator, params, at.measurements, at.truth, noise_cov=noise, prior=None, t0=at.t0
+        )
+        return jnp.sqrt(jnp.mean(mse))
+
+    return rmse
+
+
+def run(experiment: Experiment) -> None:
+    """Tunes both filters, measures them on fresh runs, and compares with the exact error."""
+    found, series, rows, notes = {}, {}, [], []
+    for one in filters():
+        tuned = experiment.piece(f"{one.name}-tuned", lambda f=one: _tuned(experiment, f))
+        measured = experiment.piece(
+            f"{one.name}-measured", lambda f=one, t=tuned: _measured(experiment, f, t)
+        )
+        found[one.name] = (one, tuned | measured)
+        series |= _labelled(one, found[one.name][1])
+        rows += _rows(one, found[one.name][1])
+        notes += [
+            f"{one.name}: the gradient of the exact error leads from {start} to {end:.4f}"
+            for start, end in zip(one.starts, tuned["optimum"], strict=True)
+        ]
+    example = _example(experiment)
+    notes += _equivalent(experiment)
+    experiment.arrays("sine", xr.Dataset({**series, **example}))
+    experiment.figure("tracks", sine_figures.tracks(example))
+    experiment.figure("rmse", sine_figures.curves(found))
+    experiment.figure("tuning", sine_figures.histories(found))
+    runs = experiment.size(10_000, 500)
+    experiment.table("sine", f"Sine: {runs} runs of 101 samples, RMSE in m", rows, notes)
+    experiment.finish()
+
+
+def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
+    """Gradient descent on a training batch, and on the exact error from both starts at once: the
+    loss is their mean and the optimizer treats each number by itself, so neither sees the other."""
+    quick = experiment.options.quick
+    steps, name = (100 if quick else 200), one.parameter
+    keys = jax.random.split(experiment.key(1), 64 if quick else 256)
+    label = f"{one.name}: tuning on {len(keys)} sampled runs"
+    with experiment.timed(label), experiment.progress(label) as report:
+        training = simulate_batch(sine(dt=DT, r=VARIANCE), keys)
+        setting = {"prior": None, "t0": 0.0, "devices": 1}
+        loss = rmse_loss(one.estimator, training.measurements, training.truth, **setting)
+        sampled = tune(loss, {name: np.asarray(one.starts[1])}, steps=steps, progress=report)
+    label = f"{one.name}: tuning on the exact error"
+    with experiment.timed(label), experiment.progress(label) as report:
+        each = jax.vmap(exact_rmse(one))
+        mean = jax.jit(lambda params: jnp.mean(each(params[name])))
+        exact = tune(mean, {name: jnp.asarray(one.starts)}, steps=steps, progress=report)
+    return {
+        "sampled": sampled.params[name],
+        "sampled_path": sampled.history["params"][name],
+        "sampled_loss": sampled.history["loss"],
+        "optimum": exact.params[name],
+        "path": exact.history["params"][name],
+    }
+
+
+def _measured(experiment: Experiment, one: Filter, tuned: Arrays) -> dict[str, Any]:
+    """RMSE of the three settings and along the curve, on runs that the tuning has not seen, and
+    the exact RMSE there and along the descents."""
+    grid = np.geomspace(*one.span, 5 if experiment.options.quick else 9)
+    value = np.array([one.published, tuned["sampled"], tuned["optimum"][0], *grid])
+    scenario, statistics = sine(dt=DT, r=VARIANCE), []
+    label = f"{one.name}: Monte Carlo"
+    with experiment.timed(label), experiment.progress(label) as report:
+        for number in value:
+            statistics.append(
+                monte_carlo(
+                    one.estimator,
+                    {one.parameter: jnp.asarray(number)},
+                    scenario,
+                    runs=experiment.size(10_000, 500),
+                    key=experiment.key(2),
+                    chunk=experiment.options.chunk or 1000,
+                )
+            )
+            report(len(statistics), len(value))
+    fine = np.geomspace(*one.span, 60)
+    with experiment.timed(f"{one.name}: exact expected error"):
+        points = np.concatenate([value, fine, tuned["path"].ravel()])
+        exact = np.asarray(jax.lax.map(exact_rmse(one), jnp.asarray(points), batch_size=16))
+    at_value, at_fine, at_path = np.split(exact, [len(value), len(value) + len(fine)])
+    roots = np.asarray([s.root("squared_error") for s in statistics])
+    single = np.sqrt(np.stack([s.per_run["squared_error"] for s in statistics[:3]]))
+    return {
+        "value": value,
+        "rmse": roots[:, 0],
+        "rmse_se": roots[:, 1],
+        "exact": at_value,
+        "single": single,
+        "fine": fine,
+        "fine_exact": at_fine,
+        "path_exact": at_path.reshape(tuned["path"].shape),
+    }
+
+
+def _rows(one: Filter, found: Arrays) -> list[dict[str, Any]]:
+    low, high = np.quantile(found["single"], [0.05, 0.95], axis=1)
+    return [
+        {
+            "filter": one.name,
+            "setting": setting,
+            "parameter": one.parameter,
+            "value": f"{found['value'][i]:.4f}",
+            "Monte Carlo RMSE": Measured(found["rmse"][i], found["rmse_se"][i]),
+            "exact expected RMSE": f"{found['exact'][i]:.4f}",
+            "90 % of single runs": f"{low[i]:.2f} to {high[i]:.2f}",
+            "paper (one run)": one.printed if i == 0 else None,
+        }
+        for i, setting in enumerate(SETTINGS)
+    ]
+
+
+def _example(experiment: Experiment) -> dict[str, xr.DataArray]:
+    """One realisation, filtered with the published settings."""
+    with experiment.timed("one realisation"):
+        seen, truth, _ = sine(dt=DT, r=VARIANCE).simulate(experiment.key(3))
+        time = {"time": ("time", np.asarray(seen.time), {"units": "s"})}
+        series = {"truth": truth, "measured": seen.value}
+        for one in filters():
+            params = {one.parameter: one.published}
+            series[one.name] = run_filter(one.estimator, params, seen, prior=None, t0=0.0).mean
+    return {
+        name: xr.DataArray(np.asarray(x)[:, 0], dims="time", coords=time, attrs={"units": "m"})
+        for name, x in series.items()
+    }
+
+
+def _equivalent(experiment: Experiment) -> list[str]:
+    """The tau that behaves like the published process noise, by two criteria."""
+    params = {"sigma_w": filters()[1].published}
+
+    def compute() -> dict[str, Any]:
+        with experiment.timed("equivalent tau"):
+            gain = random_walk_gain(params["sigma_w"] / np.sqrt(VARIANCE))
+            by_gain = -DT / jnp.log1p(-gain)
+            by_error = equivalent_tau(sine_model(VARIANCE), params, dt=DT, case=case(), steps=200)
+            return {"tau": np.asarray([by_gain, by_error])}
+
+    taus = experiment.piece("equivalent", compute)["tau"]
+    criteria = ("equal steady gain", "equal expected RMSE")
+    frame = pd.DataFrame({"criterion": criteria, **params, "equivalent_tau_s": taus})
+    experiment.csv("equivalent", frame)
+    return [
+        f"sigma_w = {params['sigma_w']} is equivalent to tau = {tau:.4f} s by {criterion}"
+        for tau, criterion in zip(taus, criteria, strict=True)
+    ]
+
+
+def _labelled(one: Filter, found: Arrays) -> dict[str, xr.DataArray]:
+    """What was found for one filter, as labelled arrays."""
+    name, rmse = one.name, {"units": "m", "long_name": f"{one.name} RMSE"}
+    given = {"units": one.unit, "long_name": one.parameter}
+    value, fine = f"{name}_{one.parameter}", f"{name}_{one.parameter}_curve"
+    descent = {"descent": [f"exact from {start}" for start in one.starts]}
+
+    def along(dim: str, at: str, x: str) -> xr.DataArray:
+        return xr.DataArray(found[x], dims=dim, coords={dim: (dim, found[at], given)}, attrs=rmse)
+
+    return {
+        f"{name}_rmse": along(value, "value", "rmse"),
+        f"{name}_rmse_se": along(value, "value", "rmse_se"),
+        f"{name}_rmse_exact": along(value, "value", "exact"),
+        f"{name}_rmse_exact_curve": along(fine, "fine", "fine_exact"),
+        f"{name}_rmse_of_run": xr.DataArray(
+            found["single"], dims=("setting", "run"), coords={"setting": list(SETTINGS)}, attrs=rmse
+        ),
+        f"{name}_sampled_{one.parameter}": xr.DataArray(
+            found["sampled_path"], dims="step", attrs=given
+        ),
+        f"{name}_sampled_loss": xr.DataArray(found["sampled_loss"], dims="step", attrs=rmse),
+        f"{name}_descent_{one.parameter}": xr.DataArray(
+            found["path"], dims=("step", "descent"), coords=descent, attrs=given
+        ),
+        f"{name}_descent_rmse": xr.DataArray(
+            found["path_exact"], dims=("step", "descent"), coords=descent, attrs=rmse
+        ),
+    }

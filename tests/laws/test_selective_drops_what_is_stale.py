@@ -1,0 +1,117 @@
+"""The selective filter: a strict limit of the delay, and its differentiable version."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from late_streams import problem, stream
+from oracles.late import selective_filter
+
+import ewif_jax as ej
+from ewif_jax.oosm.al1 import al1
+from ewif_jax.oosm.asd import asd
+from ewif_jax.oosm.drop_late import drop_late
+from ewif_jax.oosm.selective import selective
+
+GIVEN = problem(41, 3, 2)
+TIMES = np.array([0.5, 1.0, 2.0, 1.5, 1.0, 2.0, 3.0, 2.75, 0.9, 4.0, 3.0, 2.0])
+DATA = stream(GIVEN, np.random.default_rng(0), TIMES)
+
+
+def go(method, data=DATA, params=None):
+    return ej.run(method, params, data, prior=GIVEN.prior, t0=0.0)
+
+
+@pytest.mark.parametrize("max_delay", [0.25, 0.5, 1.0, 2.5])
+def test_the_cut_off_is_strict_and_the_clock_a_running_maximum(max_delay):
+    _, used = selective_filter(lambda seen, k: seen, None, TIMES, max_delay)
+    trace = go(selective(al1(GIVEN.model, 12), max_delay))
+    np.testing.assert_array_equal(trace.info.status != ej.Status.TOO_LATE, used)
+    dropped = np.flatnonzero(~np.array(used))
+    np.testing.assert_array_equal(trace.mean[dropped], trace.mean[dropped - 1])
+    np.testing.assert_array_equal(trace.info.log_likelihood[dropped], 0)
+    kept = jax.tree.map(lambda x: x[np.array(used)], DATA)
+    np.testing.assert_allclose(trace.mean[-1], go(al1(GIVEN.model, 12), kept).mean[-1], atol=1e-12)
+
+
+def test_the_two_extremes():
+    method = al1(GIVEN.model, 12)
+    plain, every, none = (
+        go(m) for m in (method, selective(method, jnp.inf), selective(method, 0.0))
+    )
+    np.testing.assert_array_equal(every.mean, plain.mean)
+    for dropped in (go(drop_late(method)), go(ej.kalman(GIVEN.model))):
+        np.testing.assert_allclose(none.mean, dropped.mean, atol=1e-12)
+        np.testing.assert_array_equal(none.info.status, dropped.info.status)
+
+
+def test_ewif_can_be_gated_too():
+    method = ej.ewif(GIVEN.model, tau=1.0)
+    dropped = go(drop_late(method))
+    late = np.maximum.accumulate(TIMES) > TIMES
+    in_order = go(method, jax.tree.map(lambda x: x[~late], DATA))
+    np.testing.assert_allclose(dropped.mean[-1], in_order.mean[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["al1", "ewif"])
+def test_a_soft_gate_is_a_noisier_measurement(name):
+    """Mean and covariance: S / g. Information: R / g."""
+    given = problem(42, 2, 1)
+    table = jnp.asarray(given.R)
+    times = np.array([1.0, 2.0, 1.5])
+    data = stream(given, np.random.default_rng(1), times)
+
+    def build(scale):
+        def R(params, sensor, t):
+            return table[sensor] + jnp.where(t == 1.5, scale, 0.0)
+
+        model = given.model._replace(measurement_cov=R)
+        return al1(model, 2) if name == "al1" else ej.ewif(model, tau=2.0)
+
+    options = {"prior": given.prior, "t0": 0.0}
+    plain = ej.run(build(0.0), None, data, **options)
+    soft = ej.run(selective(build(0.0), 0.6, softness=0.2), None, data, **options)
+    g = 1 / (1 + np.exp(-(0.6 - 0.5) / 0.2))
+    R = given.R[int(data.sensor[2]), 0, 0]
+    spread = plain.info.innovation_cov[2, 0, 0] if name == "al1" else R
+    expected = ej.run(build((1 / g - 1) * spread), None, data, **options)
+    np.testing.assert_allclose(soft.mean[2], expected.mean[2], rtol=1e-10)
+    np.testing.assert_allclose(soft.cov[2], expected.cov[2], rtol=1e-10)
+    np.testing.assert_allclose(soft.info.log_likelihood[2], g * plain.info.log_likelihood[2])
+    np.testing.assert_allclose(soft.mean[:2], plain.mean[:2], atol=1e-14)
+
+
+def test_a_soft_gate_hardens():
+    method = al1(GIVEN.model, 12)
+    hard = go(selective(method, 1.1))
+    soft = go(selective(method, 1.1, softness=1e-3))
+    np.testing.assert_allclose(soft.mean, hard.mean, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["al1", "ewif"])
+def test_the_cut_off_has_a_gradient(name):
+    method = al1(GIVEN.model, 12) if name == "al1" else ej.ewif(GIVEN.model, tau=2.0)
+    gated = selective(method, lambda p: p[0], softness=lambda p: p[1])
+
+    def loss(params):
+        trace = go(gated, params=params)
+        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov) + jnp.sum(trace.info.log_likelihood)
+
+    at, h = jnp.array([0.9, 0.4]), 1e-5
+    both = jax.jit(jax.vmap(loss))(at[None] + h * jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
+    expected = (both[::2] - both[1::2]) / (2 * h)
+    np.testing.assert_allclose(jax.grad(loss)(at), expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(loss)(at), expected, rtol=1e-6)
+
+
+def test_what_is_refused():
+    method = al1(GIVEN.model, 2)
+    with pytest.raises(ValueError, match="max_delay: expected a number >= 0"):
+        selective(method, -1.0)
+    with pytest.raises(ValueError, match="softness: expected a positive number"):
+        selective(method, 1.0, softness=0.0)
+    with pytest.raises(ValueError, match="softness: expected an estimator with a mean"):
+        go(selective(asd(GIVEN.model, 3), 1.0, softness=0.1))
+    for wrapper in (drop_late, lambda e: selective(e, 1.0)):
+        with pytest.raises(ValueError, match="estimator: expected an Estimator"):
+            wrapper(GIVEN.model)
