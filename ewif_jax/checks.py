@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ewif_jax.types import Gaussian, Measurement
 
@@ -39,8 +38,9 @@ def finite(argument: str, x: Any) -> None:
     """Refuses a known array with NaN or infinity in it."""
     value = known(x)
     if value is not None:
-        bad = np.argwhere(~np.isfinite(value))
-        require(bad.size == 0, argument, "finite numbers", _first(value, bad))
+        require(_is_numeric(value), argument, "finite numbers", repr(x))
+        bad = ~np.isfinite(value)
+        require(not bad.any(), argument, "finite numbers", _first(value, bad))
 
 
 def positive(argument: str, x: Any) -> Any:
@@ -127,7 +127,7 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     """
     ok = isinstance(measurements, Measurement)
     require(ok, "measurements", "a Measurement", type(measurements).__name__)
-    time, value, sensor, mask = measurements
+    time, value, sensor, mask = (x if hasattr(x, "dtype") else np.asarray(x) for x in measurements)
     lead = ("R", "T") if batched else ("T",)
 
     def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:
@@ -141,18 +141,19 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
         fits(f"measurements.{argument}", x, tail)
         length = np.shape(x)[np.ndim(x) - 1 - len(tail)]
         require(length == steps, f"measurements.{argument}", f"{steps} arrivals", length)
-    require(jnp.asarray(mask).dtype == bool, "measurements.mask", "booleans", mask.dtype)
-    integer = jnp.issubdtype(jnp.asarray(sensor).dtype, jnp.integer)
+    require(mask.dtype == bool, "measurements.mask", "booleans", mask.dtype)
+    integer = jnp.issubdtype(sensor.dtype, jnp.integer)
     require(integer, "measurements.sensor", "integers", sensor.dtype)
     finite("measurements.time", time)
     seen_value, seen_mask = known(value), known(mask)
     if seen_value is not None and seen_mask is not None:
-        bad = np.argwhere(~np.isfinite(seen_value) & seen_mask)
+        require(_is_numeric(seen_value), "measurements.value", "numbers", seen_value.dtype)
+        bad = ~np.isfinite(seen_value) & seen_mask
         require(
-            bad.size == 0,
+            not bad.any(),
             "measurements.value",
             "finite numbers where mask is True (mask out what is missing)",
-            _first(seen_value, bad) if bad.size else None,
+            _first(seen_value, bad),
         )
     seen_sensor = known(sensor)
     if seen_sensor is not None:
@@ -201,15 +202,17 @@ def report_times(times: Any, steps: int) -> None:
 
 
 def _is_numeric(value: np.ndarray) -> bool:
-    return value.dtype.kind in "fiu"
+    return jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
 
 
 def _plain(value: np.ndarray) -> Any:
     return value.item() if value.ndim == 0 else value.tolist()
 
 
-def _first(value: np.ndarray | Array, bad: np.ndarray) -> str:
-    if bad.size == 0:
+def _first(value: np.ndarray, bad: np.ndarray) -> str:
+    """The first bad number and where it is."""
+    if not bad.any():
         return ""
-    index = tuple(int(i) for i in bad[0])
-    return f"{value[index]} at index {index if len(index) != 1 else index[0]}"
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
+    return f"{value[index]}{where}"

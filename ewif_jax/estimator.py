@@ -92,6 +92,7 @@ def run(
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
     measurements = validated(estimator, params, measurements, prior, t0, times, clock, key)
+    prior = _prior(prior, measurements.value.dtype)
     return _run(estimator, params, measurements, prior, t0, times, clock, key)
 
 
@@ -136,10 +137,8 @@ def validated(
 def initial(
     estimator: Estimator, params: Any, prior: Gaussian | None, t0: Any, dtype: Any, key: Any
 ) -> Any:
-    """The estimator's first state, with prior and t0 in `dtype`."""
-    if prior is not None:
-        prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
-    return estimator.init(params, prior, jnp.asarray(t0, dtype), key)
+    """The estimator's first state, with prior (left known where it is known) and t0 in `dtype`."""
+    return estimator.init(params, _prior(prior, dtype), jnp.asarray(t0, dtype), key)
 
 
 def float_dtype(x: Any) -> Any:
@@ -152,11 +151,10 @@ def cast(measurement: Measurement, dtype: Any) -> Measurement:
     """The measurement with floats in `dtype`, int32 sensors (left known where they are known), and
     zeros where nothing was seen."""
     mask = jnp.asarray(measurement.mask, bool)
-    sensor = checks.known(measurement.sensor)
     return Measurement(
         jnp.asarray(measurement.time, dtype),
         jnp.where(mask, jnp.asarray(measurement.value, dtype), 0),
-        jnp.asarray(measurement.sensor, jnp.int32) if sensor is None else np.int32(sensor),
+        _in_dtype(measurement.sensor, np.int32),
         mask,
     )
 
@@ -184,6 +182,15 @@ def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurem
     return Measurement(
         jnp.asarray(time, dtype), jnp.where(mask, value, 0).astype(dtype), sensor, mask
     )
+
+
+def _prior(prior: Gaussian | None, dtype: Any) -> Gaussian | None:
+    return None if prior is None else Gaussian(*(_in_dtype(x, dtype) for x in prior))
+
+
+def _in_dtype(x: Any, dtype: Any) -> Any:
+    value = checks.known(x)
+    return jnp.asarray(x, dtype) if value is None else value.astype(dtype)
 
 
 def verdict(late: Array, present: Array, late_status: Status = Status.TOO_LATE) -> Array:

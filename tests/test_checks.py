@@ -297,7 +297,7 @@ REFUSED = {
     ),
     "H of another width than the state": (
         lambda: run(ej.kalman(ej.linear_model(SQUARE, np.ones((1, 3)), np.eye(1))), stream=one()),
-        "H: expected shape (1, 2), got shape (1, 3)",
+        "H: expected shape (m, 2), got shape (1, 3)",
     ),
     "R of another size than the value": (
         lambda: run(ej.kalman(ej.linear_model(SQUARE, np.ones((1, 2)), SQUARE)), stream=one()),

@@ -27,7 +27,7 @@ class Case(NamedTuple):
     t0: Any
 
 
-def steady_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: int) -> Array:
+def settled_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: int) -> Array:
     """The filter's gain (n, m) after `steps` equally spaced measurements of m components, started
     from nothing: the derivative of the estimate by the last measurement."""
     dtype = jnp.asarray(0.0).dtype
@@ -73,10 +73,10 @@ def equivalent_tau(
     low, high = bounds or (dt / 20, steps * dt / 10)
     exponential = ewif(model, tau=lambda p: p[0])
     noisy = information(model)
-    target = steady_gain(noisy, params, m, dt, steps)
+    target = settled_gain(noisy, params, m, dt, steps)
 
     def mismatch(tau: Array) -> Array:
-        gain = steady_gain(exponential, (tau, params), m, dt, steps)
+        gain = settled_gain(exponential, (tau, params), m, dt, steps)
         return jnp.sum(jnp.square(gain / target - 1))
 
     by_gain = _minimise(mismatch, low, high)
@@ -118,10 +118,10 @@ def equivalent_process_noise(
     exponential = ewif(model, tau=tau)
     noisy = information(model)
     some = params_of(jnp.asarray(low))
-    target = steady_gain(exponential, some, m, dt, steps)
+    target = settled_gain(exponential, some, m, dt, steps)
 
     def mismatch(q: Array) -> Array:
-        gain = steady_gain(noisy, params_of(q), m, dt, steps)
+        gain = settled_gain(noisy, params_of(q), m, dt, steps)
         return jnp.sum(jnp.square(gain / target - 1))
 
     by_gain = _minimise(mismatch, low, high)

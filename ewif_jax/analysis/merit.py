@@ -11,7 +11,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.riccati import dare, gain
 
 
-def steady_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
+def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
     r"""The gain K (n, m) of the Kalman filter after many equal steps.
 
     .. math::
@@ -43,7 +43,7 @@ def delayed_gain(F: Any, H: Any, Q: Any, R: Any, steps: Any) -> Array:
         K_n(T_d) = ((I - K H) F)^{T_d / \Delta T} K \quad (5)
 
     Args:
-        F, H, Q, R: as in `steady_gain`.
+        F, H, Q, R: as in `steady_state_gain`.
         steps: T_d / dT >= 0. A Python integer is a product of matrices; any other number goes
             through the eigenvalues (principal branch, real part), which needs distinct ones.
     """
@@ -71,7 +71,7 @@ def cutoff_delay(F: Any, H: Any, Q: Any, R: Any, *, ratio: Any = 0.6, interval: 
     exponential envelope, whose rate is the spectral radius.
 
     Args:
-        F, H, Q, R: as in `steady_gain`, over one interval between measurements.
+        F, H, Q, R: as in `steady_state_gain`, over one interval between measurements.
         ratio: k_min / k in (0, 1).
         interval: mean time between measurements in seconds.
 

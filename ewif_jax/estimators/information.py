@@ -45,6 +45,7 @@ def information(model: Model) -> Estimator:
         ahead = jnp.maximum(time, state.time)
         n = state.mean.shape[0]
         A, _ = affine_flow(model, params, ahead, state.time, dtype)
+        checks.shape("F", A, (n, n))
         Q = jnp.asarray(model.process_cov(params, state.time, ahead), dtype)
         checks.shape("Q", Q, (n, n))
         matrix = symmetric.unpack(state.matrix)

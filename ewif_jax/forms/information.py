@@ -8,11 +8,13 @@ that is still singular needs no special case.
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.small import fence, matmul, matvec
+from ewif_jax.kernels.batched import kernel
+from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model
 from ewif_jax.models.model import affine_flow, observation, size
 from ewif_jax.types import Gaussian, Info, Measurement
@@ -54,6 +56,7 @@ def transport(
     """
     dtype = state.mean.dtype
     F, c = affine_flow(model, params, state.time, time, dtype)
+    checks.shape("F", F, (state.mean.shape[0],) * 2)
     A, _ = affine_flow(model, params, time, state.time, dtype)
     mean = matvec(F, state.mean)
     return InformationState(
@@ -93,40 +96,26 @@ def contribution(
 
 def times(packed: Array, x: Array) -> Array:
     """A packed matrix times a vector."""
-    return matvec(symmetric.unpack(packed), x)
+    return symmetric.times(packed, x)
 
 
 def recentred(state: InformationState) -> InformationState:
     """The same information around the estimate, if there is one."""
-    f = factor(state.matrix)
-    shift = cholesky.solve(f, state.vector)
+    cov, full_rank = symmetric.inverse(state.matrix)
+    shift = symmetric.times(cov, state.vector)
     return state._replace(
-        mean=jnp.where(f.full_rank, state.mean + shift, state.mean),
-        vector=jnp.where(f.full_rank, 0, state.vector),
+        mean=jnp.where(full_rank, state.mean + shift, state.mean),
+        vector=jnp.where(full_rank, 0, state.vector),
     )
 
 
 def estimate(state: InformationState) -> Gaussian:
     """Mean and covariance; NaN while the information matrix is not of full rank."""
-    f = factor(state.matrix)
-    mean = state.mean + cholesky.solve(f, state.vector)
+    cov, full_rank = symmetric.inverse(state.matrix)
+    mean = state.mean + symmetric.times(cov, state.vector)
     return Gaussian(
-        jnp.where(f.full_rank, mean, jnp.nan),
-        jnp.where(f.full_rank, cholesky.inverse(f), jnp.nan),
-    )
-
-
-def factor(packed: Array) -> cholesky.Factor:
-    """The guarded factor of a packed information matrix; the identity's where it is singular, so
-    that whatever is computed from it and then discarded has a finite gradient."""
-    full = symmetric.unpack(packed)
-    f = cholesky.factor(full)
-    n = full.shape[0]
-    safe = f.full_rank
-    return cholesky.Factor(
-        jnp.where(safe, f.lower, jnp.eye(n, dtype=full.dtype)),
-        jnp.where(safe, f.reciprocal, 1),
-        safe,
+        jnp.where(full_rank, mean, jnp.nan),
+        jnp.where(full_rank, symmetric.unpack(cov), jnp.nan),
     )
 
 
@@ -150,11 +139,16 @@ def _sight(
 
 def _gained(seen: Array, difference: Array, R: Array, mask: Array) -> tuple[Array, Array]:
     noise = cholesky.factor(gaussian.mask_cov(R, mask))
-    white = fence(cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1)))
+    white = cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1))
+    return _squares(white)
+
+
+@kernel
+def _squares(white: Array) -> tuple[Array, Array]:
+    """Packed rows' rows, and rows' target, of white = (rows, target)."""
     rows, target = white[:, :-1], white[:, -1]
-    n = seen.shape[1]
-    matrix = jnp.concatenate([matvec(rows[:, i:].T, rows[:, i]) for i in range(n)])
-    return matrix, matvec(rows.T, target)
+    i, j = np.triu_indices(rows.shape[1])
+    return sum(r[i] * r[j] for r in rows), sum(r * t[None] for r, t in zip(rows, target, strict=True))
 
 
 def _info(
@@ -166,15 +160,13 @@ def _info(
     weight: Array | float,
 ) -> Info:
     mask = measurement.mask
-    f = factor(state.matrix)
-    root = cholesky.forward(f, seen.T)
+    cov, known = symmetric.inverse(state.matrix)
     innovation = gaussian.innovate(
-        difference - matvec(seen, cholesky.solve(f, state.vector)),
+        difference - matvec(seen, symmetric.times(cov, state.vector)),
         seen,
-        matmul(root.T, root) + R / weight,
+        matmul(matmul(seen, symmetric.unpack(cov)), seen.T) + R / weight,
         mask,
     )
-    known = f.full_rank
     used = known & jnp.any(mask)
     return Info(
         jnp.where(known | ~mask, innovation.value, jnp.nan),

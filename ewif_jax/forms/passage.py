@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax.forms import information as form
 from ewif_jax.forms.information import InformationState
 from ewif_jax.kernels import symmetric
 from ewif_jax.kernels.small import matmul, matvec
@@ -72,6 +71,7 @@ def carried(state: InformationState, over: Passage, to: Array) -> InformationSta
 def joined(a: InformationState, b: InformationState) -> InformationState:
     """The information of two states of one time together, around a's mean if `a` determines one
     (else around b's), which keeps the vector short."""
-    mean = jnp.where(form.factor(a.matrix).full_rank, a.mean, b.mean)
-    shifted = [s.vector + form.times(s.matrix, s.mean - mean) for s in (a, b)]
+    _, determined = symmetric.inverse(a.matrix)
+    mean = jnp.where(determined, a.mean, b.mean)
+    shifted = [s.vector + symmetric.times(s.matrix, s.mean - mean) for s in (a, b)]
     return a._replace(mean=mean, matrix=a.matrix + b.matrix, vector=shifted[0] + shifted[1])

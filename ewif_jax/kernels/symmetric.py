@@ -3,8 +3,10 @@
 What is stored this way is symmetric by construction, and its propagation is one matrix product.
 """
 
+from collections.abc import Callable
 from functools import cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -71,6 +73,74 @@ def congruence(a: Array, packed: Array) -> Array:
     With a shared by the batch this is one product with a's second power.
     """
     return _congruence(a, packed)
+
+
+def times(packed: Array, x: Array) -> Array:
+    """P x (n,) for a packed P."""
+    return _times(packed, x)
+
+
+def diagonal(packed: Array) -> Array:
+    """The diagonal (n,) of a packed matrix."""
+    n = order(packed)
+    return packed[np.diagonal(places(n))]
+
+
+def inverse(packed: Array) -> tuple[Array, Array]:
+    """P^-1, packed, and whether P has full rank; where it has not, the identity with derivative 0.
+
+    A pivot that is zero to rounding (below 8 n eps times its diagonal element) ends the rank. The
+    derivative is that of the exact inverse, -P^-1 dP P^-1.
+    """
+    result = _inverse(packed)
+    full_rank = jnp.all(diagonal(result) > 0)
+    identity = pack(jnp.eye(order(packed), dtype=packed.dtype))
+    return jnp.where(full_rank, result, identity), full_rank
+
+
+@jax.custom_jvp
+def _inverse(packed: Array) -> Array:
+    return _swept(packed)
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    result = _inverse(*primals)
+    return result, -congruence(unpack(result), *tangents)
+
+
+@kernel
+def _swept(packed: Array) -> Array:
+    """Gauss-Jordan elimination without exchanges; zero rows where there is no pivot."""
+    n, batch = order(packed), packed.ndim - 1
+    least = 8 * n * float(jnp.finfo(packed.dtype).eps) * diagonal(packed)
+    for k in range(n):
+        packed = stage(_sweep(n, k), packed, least[k], batch=batch)
+    return -packed
+
+
+@cache
+def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
+    rows, cols = np.triu_indices(n)
+
+    def swept(packed: Array, least: Array) -> Array:
+        """Exchanges the roles of unknown and right-hand side number k."""
+        shape = (-1, *(1,) * (packed.ndim - 1))
+        pivot = packed[places(n)[k, k]]
+        kept = pivot > least
+        reciprocal = jnp.where(kept, 1 / jnp.where(kept, pivot, 1), 0)
+        left = jnp.where((rows == k).reshape(shape), -1, packed[places(n)[k, rows]])
+        right = jnp.where((cols == k).reshape(shape), -1, packed[places(n)[k, cols]])
+        others = jnp.where(((rows == k) | (cols == k)).reshape(shape), 0, packed)
+        return others - reciprocal[None] * left * right
+
+    return swept
+
+
+@kernel
+def _times(packed: Array, x: Array) -> Array:
+    full = _spread(packed)
+    return sum(full[:, k] * x[None, k] for k in range(x.shape[0]))
 
 
 @kernel

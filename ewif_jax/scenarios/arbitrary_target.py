@@ -16,12 +16,12 @@ from ewif_jax.types import Measurement
 
 LENGTH, SETTLED = 60.0, 5.0
 SLOW, FAST = 0.5, 0.15
-PROMPT_SD, LATE_SD = (1.0, 4.0), (0.5, 2.0)
+PROMPT_SD, LATE_SD = (2.0, 6.0), (2.0, 6.0)
 DELAY = (0.3, 2.5)
 
 
 def arbitrary_path(time: Array) -> Array:
-    """Position (..., 2) in m at `time` (...) in seconds: smooth, with speeds from 3 to 27 m/s and
+    """Position (..., 2) in m at `time` (...) in seconds: smooth, with speeds from 4 to 10 m/s and
     turns to either side."""
     grid, east, north = _path()
     time = jnp.asarray(time)
@@ -54,7 +54,7 @@ def arbitrary_target_model(q: Any = 0.0) -> Model:
 
 def arbitrary_target(lag: float = 0.0, late_used: bool = True) -> Scenario:
     """A minute of the target. Both the noise and the sampling interval of the sensors vary along
-    the way; sensor 1 is more accurate and arrives 0.3 to 2.5 s late, sensor 0 at once.
+    the way; sensor 1 arrives 0.3 to 2.5 s late, sensor 0 at once.
 
     The paper describes its scenario in words only; this one follows them. Reports are due at each
     arrival, for the time `lag` seconds before it: 0 is the filter, 1 the paper's smoother. Truth is
@@ -97,8 +97,8 @@ def _sampling(phase: float) -> np.ndarray:
 def _path() -> tuple[Array, Array, Array]:
     """A fine grid of times, and the position there by integrating speed and heading."""
     grid = jnp.linspace(0.0, LENGTH + DELAY[1], 6251)
-    heading = 0.8 * jnp.sin(0.21 * grid) - 1.5 * jnp.sin(0.34 * grid + 1.0) + 0.05 * grid
-    speed = 15 + 8 * jnp.sin(0.17 * grid) + 4 * jnp.sin(0.53 * grid + 2.0)
+    heading = 1.2 * jnp.sin(0.13 * grid) - 0.9 * jnp.sin(0.23 * grid + 1.0) + 0.04 * grid
+    speed = 7 + 2.5 * jnp.sin(0.17 * grid) + jnp.sin(0.31 * grid + 2.0)
     step = jnp.diff(grid)
 
     def integral(rate: Array) -> Array:

@@ -58,9 +58,17 @@ def run(experiment: Experiment) -> None:
     squared, taus = found["squared_error"], faded["tau"]
     lines = [
         ("KF, late measurements dropped", squared[0], found["late_used"][0]),
-        (f"selective Al1, T_stale = {stale():.2f} s", squared[AT_STALE], found["late_used"][AT_STALE]),
+        (
+            f"selective Al1, T_stale = {stale():.2f} s",
+            squared[AT_STALE],
+            found["late_used"][AT_STALE],
+        ),
         ("Al1, everything", squared[-1], found["late_used"][-1]),
-        (f"EWIF, same gain (τ = {taus[0]:.2f} s)", faded["squared_error"][0], faded["late_used"][0]),
+        (
+            f"EWIF, same gain (τ = {taus[0]:.2f} s)",
+            faded["squared_error"][0],
+            faded["late_used"][0],
+        ),
         (f"EWIF, tuned (τ = {taus[1]:.2f} s)", faded["squared_error"][1], faded["late_used"][1]),
     ]
 
@@ -108,11 +116,11 @@ def _ewif(experiment: Experiment, scenario: Scenario, batch: Simulation) -> dict
     quick, label, estimator = experiment.options.quick, "EWIF: tuning", exponential()
     gain = random_walk_gain(maneuvering_index(Q, VARIANCE, 1.0))
     same = -1 / np.log1p(-float(gain))
-    training = arrowhead(r=VARIANCE, steps=500 if quick else 2000)
+    training = arrowhead(r=VARIANCE, steps=500 if quick else 1000)
     with experiment.timed(label), experiment.progress(label) as report:
         seen = simulate_batch(training, jax.random.split(experiment.key(1), 4 if quick else 16))
         loss = rmse_loss(estimator, seen.measurements, seen.truth, prior=None, t0=0.0)
-        tuned = tune(loss, {"tau": same}, steps=30 if quick else 60, progress=report)
+        tuned = tune(loss, {"tau": same}, steps=30 if quick else 50, progress=report)
     with experiment.timed("EWIF"):
         taus = np.asarray([same, tuned.params["tau"]])
         scores = sweep(
@@ -130,7 +138,7 @@ def _example(
         "KF": (by_al1, {"cutoff": 0.0}, scenario.prior),
         "selective Al1": (by_al1, {"cutoff": stale()}, scenario.prior),
         "Al1": (by_al1, {"cutoff": np.inf}, scenario.prior),
-        "EWIF": (by_ewif, {"tau": tau}, None),
+        "EWIF, tuned": (by_ewif, {"tau": tau}, None),
     }
     with experiment.timed("one realisation"):
         one = arrowhead(r=VARIANCE, steps=400).simulate(experiment.key(2))
@@ -151,7 +159,7 @@ def _dataset(found: Any, faded: Any, example: dict[str, np.ndarray]) -> xr.Datas
         return xr.DataArray(x, dims=("cutoff", "run")[: x.ndim], coords=at, attrs=attrs)
 
     tracks = {
-        name.replace(" ", "_"): xr.DataArray(x, dims=("time", "axis"), attrs=metres)
+        name.replace(",", "").replace(" ", "_"): xr.DataArray(x, dims=("time", "axis"), attrs=metres)
         for name, x in example.items() if name != "time"
     }  # fmt: skip
     return xr.Dataset({
@@ -168,4 +176,3 @@ def _dataset(found: Any, faded: Any, example: dict[str, np.ndarray]) -> xr.Datas
         tau=("tau", faded["tau"], {"units": "s"}),
         axis=["east", "north"],
     )  # fmt: skip
-

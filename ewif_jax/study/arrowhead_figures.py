@@ -5,15 +5,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from ewif_jax.scenarios.arrowhead import arrowhead_path
 from ewif_jax.study.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label
-from ewif_jax.study.late import rmse, rmses
+from ewif_jax.study.late import DROPPED, rmse, rmses
 
-DROPPED = "#b35806"
+
 LOOK = {
     "KF": (DROPPED, ":"),
     "selective Al1": (OTHER, "-"),
     "Al1": (KALMAN, "--"),
-    "EWIF": (EWIF, "-."),
+    "EWIF, tuned": (EWIF, "-."),
 }
 
 
@@ -22,13 +23,14 @@ def path(example: Mapping[str, np.ndarray]) -> Figure:
     figure, axes = canvas(width=6.5, height=6.5)
     lap = (example["time"] > 126) & (example["time"] <= 252)
     axes.plot(*example["measured"][lap].T, ".", color=MEASURED, markersize=4, label="measured")
-    axes.plot(*example["truth"].T, color=TRUTH, linewidth=1.2, label="truth")
+    around = arrowhead_path(np.linspace(0, 126, 500))
+    axes.plot(*around.T, color=TRUTH, linewidth=1.2, label="truth")
     for name in ("selective Al1", "Al1"):
         color, style = LOOK[name]
         axes.plot(*example[name][lap].T, style, color=color, linewidth=1.4, label=name)
     axes.set_aspect("equal")
     axes.legend(frameon=False, fontsize="small")
-    label(axes, "east [m]", "north [m]", "One lap (126 s), one measurement a second, 5 s late")
+    label(axes, "east [m]", "north [m]", "One lap: a measurement a second, 5 s late on average")
     return figure
 
 
@@ -49,6 +51,8 @@ def cutoff(
             axes.axhspan(value - error, value + error, color=color, alpha=0.3, linewidth=0)
             axes.axhline(value, color=color, linewidth=1, label=name)
     axes.axvline(stale, color=TRUTH, linestyle="--", linewidth=1, label="T_stale by eq. (8)")
+    name, mse, _ = lines[-1]
+    axes.plot([], [], " ", label=f"{name}: {rmse(mse).value:.1f} m, far below")
     axes.legend(frameon=False, fontsize="small")
     label(axes, "cut-off [s]", "RMSE [m]", "Old measurements harm a filter with a wrong model")
     return figure

@@ -1,7 +1,7 @@
 """What the studies of late measurements share: sweeps over settings on the same runs, and their
 errors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -30,6 +30,9 @@ def too_late(step: Step, truth: Array, mask: Array) -> Array:
     return (step.info.status == Status.TOO_LATE).astype(step.mean.dtype)
 
 
+DROPPED = "#b35806"
+"""colour of what drops late measurements"""
+
 METRICS: dict[str, Score] = {
     "squared_error": squared_error, "late_used": late_used, "too_late": too_late
 }  # fmt: skip
@@ -46,24 +49,26 @@ def sweep(
 ) -> dict[str, np.ndarray]:
     """Averages over the arrivals (V, R) of `METRICS`, for V parameter settings on the same R runs.
 
-    `settings` are parameters by name, (V,) each. All settings that fit into `chunk` (1024) runs
-    are one batch. `setting` (prior, t0, clock) as in `run_batch`.
+    `settings` are parameters by name, (V,) or (V, R) each. All settings that fit into `chunk`
+    (1024) runs are one batch. `setting` (prior, t0, clock) as in `run_batch`.
     """
-    count = len(next(iter(settings.values())))
     runs = batch.truth.shape[0]
-    group = min(max((chunk or 1024) // runs, 1), count)
+    full = {
+        name: np.broadcast_to(np.reshape(v, (len(v), -1)), (len(v), runs))
+        for name, v in settings.items()
+    }
+    count = len(next(iter(full.values())))
+    parts = -(-count // max((chunk or 1024) // runs, 1))
+    size = -(-count // parts)
     found = []
-    for begin in range(0, count, group):
-        some = {name: np.asarray(v)[begin : begin + group] for name, v in settings.items()}
+    for begin in range(0, count, size):
+        # equal parts (the last padded) are compiled once
+        index = np.minimum(np.arange(begin, begin + size), count - 1)
+        some = {name: v[index].reshape(-1) for name, v in full.items()}
         found.append(_averages(estimator, some, batch, setting))
         if progress is not None:
-            progress(min(begin + group, count), count)
-    return {name: np.concatenate([f[name] for f in found]) for name in METRICS}
-
-
-def joined(batches: Sequence[Simulation]) -> Simulation:
-    """Batches of runs as one."""
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
+            progress(min(begin + size, count), count)
+    return {name: np.concatenate([f[name] for f in found])[:count] for name in METRICS}
 
 
 def history_needed(measurements: Measurement) -> int:
@@ -85,12 +90,14 @@ def rmse(squared: np.ndarray) -> Measured:
     return Measured(value, error / (2 * value))
 
 
+def mean_of(values: np.ndarray) -> Measured:
+    """Mean of independent values, with its standard error."""
+    return Measured(float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size)))
+
+
 def paired(squared: np.ndarray, other: np.ndarray) -> Measured:
     """Difference of the RMSE of two methods on the same runs, run by run."""
-    difference = np.sqrt(squared) - np.sqrt(other)
-    return Measured(
-        float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(difference.size))
-    )
+    return mean_of(np.sqrt(squared) - np.sqrt(other))
 
 
 def rmses(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,8 +109,8 @@ def rmses(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _averages(
     estimator: Estimator, settings: dict[str, np.ndarray], batch: Simulation, setting: Any
 ) -> dict[str, np.ndarray]:
-    count = len(next(iter(settings.values())))
     runs = batch.truth.shape[0]
+    count = next(iter(settings.values())).size // runs
 
     def tiled(x: Array) -> Array:
         return jnp.tile(x, (count,) + (1,) * (x.ndim - 1))
@@ -111,7 +118,7 @@ def _averages(
     many = jax.tree.map(tiled, batch)
     scores = scored(
         estimator,
-        {name: jnp.repeat(jnp.asarray(v), runs) for name, v in settings.items()},
+        {name: jnp.asarray(v) for name, v in settings.items()},
         many.measurements,
         many.truth,
         scores=METRICS,

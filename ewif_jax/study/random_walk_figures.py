@@ -8,28 +8,28 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ewif_jax.study.figures import EWIF, KALMAN, OTHER, TRUTH, canvas, label
-from ewif_jax.study.late import rmse, rmses
+from ewif_jax.study.late import DROPPED, rmse, rmses
 
-DROPPED, EXACT = "#b35806", "#222222"
+EXACT = "#222222"
 
 
 def methods(
     cases: Sequence[Any],
-    found: Mapping[str, Any],
+    found: Sequence[Mapping[str, np.ndarray]],
     theoretical: Callable[[float], float],
     multiples: np.ndarray,
 ) -> Figure:
     """Fig. 4: RMSE against the cut-off, one panel for each process noise."""
     figure, axes = canvas(1, 3, width=13, height=4.4)
     inside = np.isfinite(multiples) & (multiples > 0)
-    for ax, case in zip(axes, cases, strict=True):
-        one, limit = found[case.name], theoretical(case.sigma)
+    for ax, case, one in zip(axes, cases, found, strict=True):
+        limit = theoretical(case.sigma)
         squared = one["squared_error"]
         levels = (
             ("KF, late dropped", squared[0], DROPPED, ":"),
             ("Al1, everything", squared[-1], KALMAN, "--"),
             ("exact, everything", one["exact"], EXACT, "-"),
-            ("EWIF, everything", one["ewif"][0], EWIF, "-."),
+            ("EWIF, everything", one["ewif"], EWIF, "-."),
         )
         for name, mse, color, style in levels:
             value, error = rmse(mse)
@@ -42,27 +42,29 @@ def methods(
         )  # fmt: skip
         ax.axvline(limit, color=TRUTH, linestyle="--", linewidth=0.9, label="T_d of eq. (8)")
         ax.set_xscale("log")
-        title = f"{case.name}: σ_Q = {case.sigma:g}, mean delay {case.delay:g} s"
+        title = f"{case.name}: sigma_Q = {case.sigma:g}, mean delay {case.delay:g} s"
         label(ax, "cut-off [s]", "RMSE [m] ± 1 s.e." if ax is axes[0] else "", title)
     axes[0].legend(frameon=False, fontsize="small")
     return figure
 
 
 def delays(
-    swept: Mapping[float, Any],
+    squared: np.ndarray,
+    sigmas: Sequence[float],
     mean_delays: np.ndarray,
     theoretical: Callable[[float], float],
     multiples: np.ndarray,
     wide: bool,
 ) -> Figure:
-    """Figs. 5 (linear, narrow) and 6 (logarithmic, wide): one curve for each mean delay."""
+    """Figs. 5 (linear, narrow) and 6 (logarithmic, wide): one curve for each mean delay, from
+    `squared` (V, sigmas, delays, R)."""
     figure, axes = canvas(2, 2, width=11, height=7.5)
     colors = colormaps["viridis"](np.linspace(0, 0.9, mean_delays.size))
     shown = np.isfinite(multiples) & ((multiples > 0) if wide else (multiples <= 5))
-    for number, (ax, (sigma, found)) in enumerate(zip(axes.flat, swept.items(), strict=True)):
+    for number, (ax, sigma) in enumerate(zip(axes.flat, sigmas, strict=True)):
         limit = theoretical(sigma)
         for i, delay in enumerate(mean_delays):
-            values, errors = rmses(found["squared_error"][:, i])
+            values, errors = rmses(squared[:, number, i])
             best = int(np.argmin(values[shown]))
             cutoffs = multiples[shown] * limit
             ax.errorbar(
@@ -76,7 +78,7 @@ def delays(
             ax.set_xscale("log")
         label(
             ax, "cut-off [s]" if number > 1 else "", "RMSE [m] ± 1 s.e." if number % 2 == 0 else "",
-            f"σ_Q = {sigma:g}: T_d = {limit:.3g} s (dashed)",
+            f"sigma_Q = {sigma:g}: T_d = {limit:.3g} s (dashed)",
         )  # fmt: skip
     axes[0, 0].legend(title="mean delay", frameon=False, fontsize="x-small", ncols=2)
     return figure

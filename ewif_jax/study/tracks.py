@@ -68,7 +68,12 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
     value = _padded([place[0] for place in places], np.nan)
     present = _padded([np.ones(len(group), bool) for _, group in groups], False)
     time, arrival = (
-        _padded([group[name].to_numpy() - first for (_, group), first in zip(groups, start, strict=True)])
+        _padded(
+            [
+                group[name].to_numpy() - first
+                for (_, group), first in zip(groups, start, strict=True)
+            ]
+        )
         for name in ("time", "arrival")
     )
     code = [np.searchsorted(sensors, group["sensor"]).astype(np.int32) for _, group in groups]

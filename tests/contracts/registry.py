@@ -25,6 +25,7 @@ from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
 PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1, "window": 2.45, "max_delay": 0.77}
 LAG = 4
 T0 = 0.0
+STEPS = 12
 LAST = 4.0
 """No time in the standard stream is later."""
 

@@ -152,3 +152,19 @@ def test_a_missing_prior_and_a_bad_model_are_refused(build):
         ej.run(build(MODEL), PARAMS, LATE, prior=None, t0=0.0)
     with pytest.raises(ValueError, match="model: expected a Model"):
         build("model")
+
+
+@pytest.mark.parametrize("name", ["al1", "asd", "selective"])
+def test_a_batch_along_the_last_axis_is_the_loop(name):
+    """The fast layout: scan over vmap(step, in_axes=-1, out_axes=-1)."""
+    method, runs = METHODS[name], 3
+    values = np.random.default_rng(2).normal(size=(len(LATE.time), 1, runs))
+    spread = jax.tree.map(lambda x: jnp.stack([x] * runs, -1), LATE)._replace(value=values)
+    first = method.init(PARAMS, PRIOR, jnp.zeros(()))
+    first = jax.tree.map(lambda x: jnp.stack([x] * runs, -1), first)
+    one = jax.vmap(lambda s, z: ej.step(method, PARAMS, s, z)[0], in_axes=-1, out_axes=-1)
+    last, _ = jax.lax.scan(lambda s, z: (one(s, z), None), first, spread)
+    means = jax.vmap(lambda s: method.estimate(PARAMS, s).mean, in_axes=-1)(last)
+    for k in range(runs):
+        alone = ej.run(method, PARAMS, LATE._replace(value=values[..., k]), prior=PRIOR, t0=0.0)
+        np.testing.assert_allclose(means[k], alone.mean[-1], atol=1e-12)

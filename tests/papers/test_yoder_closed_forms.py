@@ -16,7 +16,7 @@ from ewif_jax.analysis.merit import (
     maneuvering_index,
     random_walk_cutoff,
     random_walk_gain,
-    steady_gain,
+    steady_state_gain,
 )
 
 DT = 0.5
@@ -50,10 +50,10 @@ def test_cutoffs_of_figures_4_and_5(sigma_q, published):
 
 @pytest.mark.parametrize("index", INDICES)
 def test_closed_forms_solve_the_riccati_equation(index):
-    walk = steady_gain(1.0, 1.0, index**2, 1.0)
+    walk = steady_state_gain(1.0, 1.0, index**2, 1.0)
     np.testing.assert_allclose(walk, random_walk_gain(index)[None, None], rtol=1e-10)
     alpha, beta = alpha_beta_gains(index)
-    gain = steady_gain(*dwna(index))
+    gain = steady_state_gain(*dwna(index))
     np.testing.assert_allclose(gain, np.array([[alpha], [beta / DT]]), rtol=1e-10)
 
 
@@ -79,7 +79,7 @@ def test_no_digits_are_lost_at_either_end():
 @pytest.mark.parametrize("index", [0.3, 2.0, 20.0])
 def test_eigenvalues(index):
     system = dwna(index)
-    loop = (np.eye(2) - np.asarray(steady_gain(*system)) @ H) @ F
+    loop = (np.eye(2) - np.asarray(steady_state_gain(*system)) @ H) @ F
     found = np.sort_complex(np.asarray(alpha_beta_eigenvalues(index)))
     np.testing.assert_allclose(found, np.sort_complex(np.linalg.eigvals(loop)), atol=1e-9)
     assert (np.abs(found.imag) > 0).all() == (index < 8)
@@ -92,11 +92,11 @@ def test_riccati_equation_with_singular_noise_against_scipy():
         root, R = rng.normal(size=(n, 1)), np.diag([0.5, 2.0])
         P = solve_discrete_are(A.T, C.T, root @ root.T, R)
         expected = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
-        np.testing.assert_allclose(steady_gain(A, C, root @ root.T, R), expected, rtol=1e-8)
+        np.testing.assert_allclose(steady_state_gain(A, C, root @ root.T, R), expected, rtol=1e-8)
 
 
 def test_without_a_steady_state_the_gain_is_nan():
-    assert np.isnan(steady_gain(np.eye(2), H, np.eye(2), 1.0)).all()
+    assert np.isnan(steady_state_gain(np.eye(2), H, np.eye(2), 1.0)).all()
 
 
 @pytest.mark.parametrize("steps", [0, 1, 4])
@@ -118,7 +118,7 @@ def test_the_envelope_holds_the_oscillating_gain():
     system = dwna(1.0)
     rate = 0.1 ** (1 / float(cutoff_delay(*system, ratio=0.1)))
     np.testing.assert_allclose(rate, np.abs(alpha_beta_eigenvalues(1.0)).max())
-    K = steady_gain(*system)
+    K = steady_state_gain(*system)
     loop = (np.eye(2) - np.asarray(K) @ H) @ F
     gains = np.array([np.linalg.matrix_power(loop, k) @ K for k in range(40)])[..., 0]
     assert (gains[:, 0] < 0).any()
@@ -156,7 +156,7 @@ def test_gradients():
     def loss(x):
         system = F, H, x[0] * Q, x[1:2, None]
         delayed = delayed_gain(*system, x[2])
-        return jnp.sum(steady_gain(*system)) + jnp.sum(delayed) + cutoff_delay(*system)
+        return jnp.sum(steady_state_gain(*system)) + jnp.sum(delayed) + cutoff_delay(*system)
 
     at, h = jnp.array([1.2, 0.4, 2.5]), 1e-6
     shifts = h * np.eye(3)
@@ -167,9 +167,9 @@ def test_gradients():
 
 def test_what_is_refused():
     with pytest.raises(ValueError, match="R: expected a positive definite matrix"):
-        steady_gain(1.0, 1.0, 1.0, 0.0)
+        steady_state_gain(1.0, 1.0, 1.0, 0.0)
     with pytest.raises(ValueError, match=r"Q: expected shape \(2, 2\)"):
-        steady_gain(F, H, 1.0, 1.0)
+        steady_state_gain(F, H, 1.0, 1.0)
     with pytest.raises(ValueError, match="ratio"):
         cutoff_delay(1.0, 1.0, 1.0, 1.0, ratio=1.0)
     with pytest.raises(ValueError, match="motion"):
