@@ -6,16 +6,16 @@ argument, what was expected and what came.
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from ewif_jax.types import Gaussian, Measurement
 
 
 def known(x: Any) -> np.ndarray | None:
     """`x` as a NumPy array if its value is known now, else None."""
-    return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
+    return None if isinstance(x, Tracer) else np.asarray(x)
 
 
 def require(condition: Any, argument: str, expected: str, got: Any) -> None:

@@ -19,9 +19,7 @@ PRIOR = ej.Gaussian(np.zeros(3), np.diag([1.0, 1.0, 4.0]))
 FILTERS = {
     "ewif": ej.ewif(WORLD, TAU),
     "fading": ej.fading(WORLD, float(np.exp(DT / (2 * TAU)))),
-    "fading by inflation": ej.fading(
-        WORLD, inflation=lambda p, t0, t1: jnp.exp((t1 - t0) / TAU)
-    ),
+    "fading by inflation": ej.fading(WORLD, inflation=lambda p, t0, t1: jnp.exp((t1 - t0) / TAU)),
     "fading, Q = 0": ej.fading(
         constant_acceleration(sensors=position_sensor(R)),
         inflation=lambda p, t0, t1: jnp.exp((t1 - t0) / TAU),
@@ -41,7 +39,7 @@ def measured(times):
 def stream(times, values, dtype):
     """The same numbers in either dtype: float32 rounds a stamp of 1000 s by up to 3e-5 s, which is
     an error of the data and not of the filter."""
-    return ej.stream(times.astype(np.float32).astype(dtype), values.astype(np.float32).astype(dtype))
+    return ej.stream(*(x.astype(np.float32).astype(dtype) for x in (times, values)))
 
 
 def scaled_error(single, double):

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import checkify
 from jax.extend.core import jaxpr_as_fun
 
@@ -47,4 +48,4 @@ def _clamps(see: Callable[..., Any], index: int, inputs: tuple) -> bool:
 
 def _example(x: Any) -> Any:
     """`x` itself, or ones where its value is not known yet."""
-    return np.ones(x.shape, x.dtype) if isinstance(x, jax.core.Tracer) else x
+    return np.ones(x.shape, x.dtype) if isinstance(x, Tracer) else x

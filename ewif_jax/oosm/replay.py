@@ -73,6 +73,8 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     ) -> tuple[ReplayState, Info]:
         size = jnp.shape(measurement.value)[0]
         checks.require(size <= width, "width", f"room for {size} components", width)
+        if checks.known(measurement.sensor) is not None:  # in the buffer it is not known any more
+            jax.eval_shape(lambda: estimator.update(params, state.current, measurement))
         sorted_in, place = _insert(state.buffer, _padded(measurement, width))
 
         def one(at: Any, entry: Measurement) -> tuple[Any, Info]:
@@ -87,17 +89,17 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         infos = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
         total = jnp.sum(infos.log_likelihood).astype(state.evidence.dtype)
         late = measurement.time < state.time
+        present = jnp.any(measurement.mask)
         known = measurement.time >= state.base.time
         info = jax.tree.map(lambda x: x[place], infos)
         used_late = late & (info.status == Status.USED)
         info = info._replace(
-            log_likelihood=total - state.evidence,
+            log_likelihood=jnp.where(present, total - state.evidence, 0),
             delay=state.time - measurement.time,
             status=jnp.where(used_late, jnp.int32(Status.LATE_USED), info.status),
         )
         evidence = total - infos.log_likelihood[0]
         updated = ReplayState(state.time, current, base, rest, evidence)
-        present = jnp.any(measurement.mask)
         return choose(known & present, updated, state), too_late(info, ~known)
 
     def estimate(params: Any, state: ReplayState) -> Gaussian:

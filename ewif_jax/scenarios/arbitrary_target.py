@@ -20,7 +20,7 @@ PROMPT_SD, LATE_SD = (2.0, 6.0), (2.0, 6.0)
 DELAY = (0.3, 2.5)
 
 
-def arbitrary_path(time: Array) -> Array:
+def arbitrary_path(time: Any) -> Array:
     """Position (..., 2) in m at `time` (...) in seconds: smooth, with speeds from 4 to 10 m/s and
     turns to either side."""
     grid, east, north = _path()
@@ -45,9 +45,7 @@ def arbitrary_target_model(q: Any = 0.0) -> Model:
             del params
             return jnp.square(arbitrary_noise(number, t)) * jnp.eye(2)
 
-        return Sensor(
-            lambda params, x, t: x[:2], cov, (False, False), lambda n: np.eye(2, n)
-        )
+        return Sensor(lambda params, x, t: x[:2], cov, (False, False), lambda n: np.eye(2, n))
 
     return models.constant_acceleration(sensors=[sensor(0), sensor(1)], q=q, dims=2)
 
@@ -79,7 +77,7 @@ def arbitrary_target(lag: float = 0.0, late_used: bool = True) -> Scenario:
         if not late_used:
             stream = stream._replace(mask=stream.mask & (stream.sensor == 0)[:, None])
         report = arrived.arrival - lag
-        settled = (report > SETTLED)[:, None]
+        settled = jnp.broadcast_to((report > SETTLED)[:, None], (report.shape[0], 2))
         return Simulation(stream, jnp.where(settled, arbitrary_path(report), jnp.nan), report)
 
     return Scenario(simulate, None, 0.0)

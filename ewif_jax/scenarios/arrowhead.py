@@ -17,7 +17,7 @@ EKF_Q = (0.0383, 0.0383, 0.1768, 0.0139)
 EKF_R = (2000.0, 2000.0, 4.0, 0.04)
 
 
-def arrowhead_path(time: Array) -> Array:
+def arrowhead_path(time: Any) -> Array:
     r"""Position (..., 2) in m at `time` (...) in seconds.
 
     .. math::
@@ -32,7 +32,7 @@ def arrowhead_path(time: Array) -> Array:
     return RADIUS * jnp.stack([east, north], -1)
 
 
-def arrowhead_state(time: Array) -> Array:
+def arrowhead_state(time: Any) -> Array:
     """x, y (m), speed (m/s) and heading (rad) along the path, (..., 4)."""
     time = jnp.asarray(time)
     position, velocity = jax.jvp(arrowhead_path, (time,), (jnp.ones_like(time),))
@@ -118,7 +118,7 @@ def _delayed(path: Any, r: Any, dt: float, mean_delay: float, steps: int) -> Sce
         noise, wait = jax.random.split(key)
         time = regular_times(dt, steps, start=dt)
         seen = path(time)
-        value = seen + jnp.sqrt(jnp.asarray(r)) * jax.random.normal(noise, (steps, size))
+        value = seen + jnp.sqrt(jnp.asarray(r))[None] * jax.random.normal(noise, (steps, size))
         arrived = deliver(time, value, exponential_delays(wait, mean_delay, steps))
         newest = lax.cummax(arrived.order)
         return Simulation(arrived.measurements, seen[newest, :2])

@@ -20,10 +20,10 @@ def random_walk_model(q: Any = 25.0, r: Any = 2500.0) -> Model:
 
 
 def random_walk(
-    q: float = 25.0,
+    q: Any = 25.0,
     r: float = 2500.0,
     mean_interval: float = 0.2,
-    mean_delay: float = 4.0,
+    mean_delay: Any = 4.0,
     steps: int = 5000,
 ) -> Scenario:
     r"""A position driven by white noise, :math:`w \sim N(0, q\,\Delta t)`, measured at the events

@@ -3,7 +3,6 @@ sensor."""
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -35,10 +34,11 @@ def run(experiment: Experiment) -> None:
     """Tracks the target under the four regimes, draws and animates it."""
     runs = experiment.size(1000, 20)
     estimator = ewif(arbitrary_target_model(), tau=lambda p: p["tau"])
-    squared = {
-        name: experiment.piece(f"regime-{i}", lambda n=name: _errors(experiment, estimator, n, runs))
-        for i, name in enumerate(REGIMES)
-    }  # fmt: skip
+    squared = {}
+    for i, name in enumerate(REGIMES):
+        squared[name] = experiment.piece(
+            f"regime-{i}", lambda n=name: _errors(experiment, estimator, n, runs)
+        )
     example = _example(experiment, estimator)
     experiment.arrays("arbitrary_target", _dataset(squared, example))
     experiment.figure("fig2", figures.snapshot(example, list(REGIMES)))

@@ -159,9 +159,10 @@ def _dataset(found: Any, faded: Any, example: dict[str, np.ndarray]) -> xr.Datas
         return xr.DataArray(x, dims=("cutoff", "run")[: x.ndim], coords=at, attrs=attrs)
 
     tracks = {
-        name.replace(",", "").replace(" ", "_"): xr.DataArray(x, dims=("time", "axis"), attrs=metres)
-        for name, x in example.items() if name != "time"
-    }  # fmt: skip
+        name.replace(",", "").replace(" ", "_"): (("time", "axis"), x, metres)
+        for name, x in example.items()
+        if name != "time"
+    }
     return xr.Dataset({
         "rmse": by_cutoff(values, **metres),
         "rmse_se": by_cutoff(errors, **metres),

@@ -1,6 +1,7 @@
 """The extended Kalman filter on the arrowhead: section 4.3 and Fig. 10 of Yoder et al."""
 
 import math
+from bisect import bisect_right
 from typing import Any
 
 import jax
@@ -17,7 +18,8 @@ from ewif_jax.study.figures import OTHER, canvas, label
 from ewif_jax.study.late import DROPPED, mean_of, rmse, rmses, sweep
 from ewif_jax.study.timing import timed
 
-LIMITS = (0.0, 1.5, 2.5, 3.5, 5.0, 7.5, 10.0, 15.0, math.inf)
+LIMITS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, math.inf)
+"""seconds; delays are whole ones, and what is older than the limit is dropped"""
 
 
 def run(experiment: Experiment) -> None:
@@ -81,21 +83,21 @@ def steps_again(times: np.ndarray, limits: tuple[float, ...]) -> np.ndarray:
     for i, limit in enumerate(limits):
         for j, time in enumerate(times):
             newest = np.maximum.accumulate(time)
-            taken = np.sort(time[:0])
-            for t, top in zip(time, newest, strict=True):
-                if top - t < limit or top == t:
-                    place = np.searchsorted(taken, t, side="right")
-                    found[i, j] += taken.size - place
-                    taken = np.insert(taken, place, t)[-200:]
+            taken: list[float] = []
+            for t, top in zip(time.tolist(), newest.tolist(), strict=True):
+                if top - t <= limit:
+                    place = bisect_right(taken, t)
+                    found[i, j] += len(taken) - place
+                    taken.insert(place, t)
     return found / times.shape[1]
 
 
 def _limited(
     experiment: Experiment, scenario: Any, batch: Simulation, limit: float
 ) -> dict[str, Any]:
-    """One maximum delay, with a buffer that just covers it; run once more for the time."""
-    longest = float(np.max(np.maximum.accumulate(np.asarray(batch.measurements.time), 1)
-                           - np.asarray(batch.measurements.time)))  # fmt: skip
+    """One maximum delay, with a buffer that just covers it; the time is the best of three."""
+    stamps = np.asarray(batch.measurements.time)
+    longest = float(np.max(np.maximum.accumulate(stamps, axis=1) - stamps))
     slots = max(math.ceil(min(limit, longest)), 1)
     estimator = selective(
         replay(extended(arrowhead_ekf_model()), slots, width=4), lambda p: p["limit"]
@@ -104,15 +106,19 @@ def _limited(
 
     def measured() -> dict[str, np.ndarray]:
         return sweep(
-            estimator, {"limit": np.asarray([limit])}, batch, prior=scenario.prior, t0=0.0,
+            estimator, {"limit": np.asarray([limit + 0.5])}, batch, prior=scenario.prior, t0=0.0,
             chunk=experiment.options.chunk,
         )  # fmt: skip
 
     with experiment.timed(label):
         found = measured()
-    with timed() as timing:
-        measured()
-    return {**found, "slots": slots, "seconds": timing.run}
+    times = []
+    for _ in range(3):
+        with timed() as timing:
+            measured()
+        times.append(timing.run)
+    first = {name: x[0] for name, x in found.items()}
+    return {**first, "slots": slots, "seconds": min(times)}
 
 
 def _figure(
@@ -123,8 +129,8 @@ def _figure(
     values, errors = rmses(squared)
     spread = np.sqrt(squared).std(1, ddof=1)
     axes[0].fill_between(
-        limits[inside], (values - spread)[inside], (values + spread)[inside], color=OTHER, alpha=0.2,
-        linewidth=0, label="± 1 standard deviation of a run",
+        limits[inside], (values - spread)[inside], (values + spread)[inside], color=OTHER,
+        alpha=0.2, linewidth=0, label="± 1 standard deviation of a run",
     )  # fmt: skip
     axes[0].errorbar(
         limits[inside], values[inside], errors[inside], fmt="o-", color=OTHER, capsize=3,

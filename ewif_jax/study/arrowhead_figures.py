@@ -9,7 +9,6 @@ from ewif_jax.scenarios.arrowhead import arrowhead_path
 from ewif_jax.study.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label
 from ewif_jax.study.late import DROPPED, rmse, rmses
 
-
 LOOK = {
     "KF": (DROPPED, ":"),
     "selective Al1": (OTHER, "-"),

@@ -11,7 +11,7 @@ from jax import Array
 
 from ewif_jax.analysis.merit import delayed_gain, gain_history, steady_state_gain
 from ewif_jax.scenarios.delays import poisson_times
-from ewif_jax.study import gains_figures
+from ewif_jax.study import gains_figures as figures
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.late import mean_of
 
@@ -25,8 +25,8 @@ class Case(NamedTuple):
 
     name: str
     interval: float
-    F: Callable[[Array], Array]
-    Q: Callable[[Array], Array]
+    F: Callable[[Any], Array]
+    Q: Callable[[Any], Array]
     H: Array
     lag: int
     components: tuple[str, ...]
@@ -90,10 +90,9 @@ def run(experiment: Experiment) -> None:
         rows += _rows(case, ages, gains, theory)
         arrays |= _arrays(case, ages, gains, theory)
     experiment.arrays("gains", xr.Dataset(arrays))
-    for name, draw in (
-        ("fig1", gains_figures.low), ("fig2", gains_figures.typical), ("fig3", gains_figures.velocity)
-    ):  # fmt: skip
-        experiment.figure(name, draw(*found[name], closed_form))
+    draw = {"fig1": figures.low, "fig2": figures.typical, "fig3": figures.velocity}
+    for name, (case, ages, gains) in found.items():
+        experiment.figure(name, draw[name](case, ages, gains, closed_form))
     experiment.table(
         "gains", f"Gain of old measurements, {runs} Poisson sequences", rows,
         ["ratio: logarithm of actual over closed form at the actual age, averaged.",

@@ -79,7 +79,7 @@ def history_needed(measurements: Measurement) -> int:
     for time, top in zip(times, newest, strict=True):
         records = np.unique(top)
         behind = np.searchsorted(records, top) - np.searchsorted(records, time, side="right")
-        needed = max(needed, int(behind.max()))
+        needed = max(needed, int(behind.max()) + 1)
     return needed
 
 

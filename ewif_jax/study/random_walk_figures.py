@@ -73,7 +73,6 @@ def delays(
             )  # fmt: skip
             ax.plot(cutoffs[best], values[shown][best], "o", color=colors[i], fillstyle="none")
         ax.axvline(limit, color=TRUTH, linestyle="--", linewidth=0.9)
-        ax.set_yscale("log")
         if wide:
             ax.set_xscale("log")
         label(

@@ -1,7 +1,7 @@
 """A CSV file of measurements: which column is what, and whether it can be used."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -56,7 +56,7 @@ def read(
         Refused: no such file, an empty one, a column that is not there, or a cell that is not a
             finite number where one is needed; the message names the file, the line and the column.
     """
-    table = _table(path)
+    table: Any = _table(path)
     columns = _columns(path, list(table), time, arrival, track, sensor, values, latlon)
     table = table[(table != "").any(axis=1)]
     if table.empty:
@@ -75,7 +75,7 @@ def read(
     return Readings(columns, line, stamp, arrived, names.to_numpy(), sensors.to_numpy(), value)
 
 
-def _table(path: Path) -> pd.DataFrame:
+def _table(path: Path) -> Any:
     """All cells as stripped text, blank lines kept, so that row i is line i + 2."""
     try:
         table = pd.read_csv(
@@ -137,10 +137,10 @@ def _columns(
     )
 
 
-def _numbers(path: Path, table: pd.DataFrame, name: str, needed: bool = False) -> np.ndarray:
+def _numbers(path: Path, table: Any, name: str, needed: bool = False) -> np.ndarray:
     """A column as floats: NaN where a cell is empty, unless a number is `needed`."""
     text = table[name]
-    number = pd.to_numeric(text, errors="coerce").to_numpy(float)
+    number = np.asarray(pd.to_numeric(text, errors="coerce"), float)
     bad = ~np.isfinite(number) & (needed | (text != "").to_numpy())
     if bad.any():
         first = int(np.argmax(bad))
@@ -149,7 +149,7 @@ def _numbers(path: Path, table: pd.DataFrame, name: str, needed: bool = False) -
     return number
 
 
-def _on_earth(path: Path, table: pd.DataFrame, columns: Columns, value: np.ndarray) -> None:
+def _on_earth(path: Path, table: Any, columns: Columns, value: np.ndarray) -> None:
     for name, number, bound in zip(columns.values, value.T, (90, 360), strict=True):
         bad = np.abs(number) > bound
         if bad.any():

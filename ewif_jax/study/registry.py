@@ -24,4 +24,18 @@ STUDIES = (
     Study(
         "sine", "EWIF and Kalman filter on a noisy sine, tuned by gradient", "ewif_jax.study.sine"
     ),
+    Study("gains", "how the weight of a late measurement decays", "ewif_jax.study.gains"),
+    Study("random-walk", "late measurements up to a cut-off", "ewif_jax.study.random_walk"),
+    Study("arrowhead", "late measurements under a wrong model", "ewif_jax.study.arrowhead"),
+    Study("arrowhead-ekf", "the same with an extended filter", "ewif_jax.study.arrowhead_ekf"),
+    Study(
+        "arbitrary-target",
+        "two sensors, one late: filter and smoother, animated",
+        "ewif_jax.study.arbitrary_target",
+    ),
+    Study(
+        "tuning-under-delay",
+        "tau, q and the cut-off by gradient through late measurements",
+        "ewif_jax.study.tuning_under_delay",
+    ),
 )

@@ -34,10 +34,10 @@ def _compilations() -> list[tuple[float, float]]:
     """(begin, end) of everything JAX has compiled since the first call."""
     events: list[tuple[float, float]] = []
 
-    def listen(event: str, seconds: float, **_: object) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
-            events.append((now - seconds, now))
+            events.append((now - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     return events

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pandas as pd
 import xarray as xr
 
@@ -19,6 +20,12 @@ from ewif_jax.tuning import tune
 from ewif_jax.types import Measurement, Status
 
 AXES = "xyz"
+LABEL = {
+    "median": "median prediction error (smooth) [m]",
+    "robust": "mean prediction error [m]",
+    "squared": "root mean square prediction error [m]",
+    "likelihood": "mean negative log likelihood",
+}
 
 
 class Outcome(NamedTuple):
@@ -57,7 +64,8 @@ def track(arguments: Any, options: Options) -> None:
     experiment.figure("tracks", track_figures.tracks(tracks, outcomes[0].after))
     experiment.figure("innovations", track_figures.innovations(tracks, outcomes[0], counted))
     if arguments.tune:
-        experiment.figure("tuning", track_figures.histories(outcomes, chosen.name, chosen.unit))
+        drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
+        experiment.figure("tuning", drawn)
     rows = [row for outcome in outcomes for row in _rows(outcome, chosen, counted, options.seed)]
     title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
     experiment.table("track", title, rows, [_statuses(tracks, outcomes[0])])
@@ -77,13 +85,14 @@ def _outcome(
         before = after = filtered(chosen, chosen.params, measurements)
     start = chosen.params[chosen.name]
     if not arguments.tune:
-        return Outcome(stamps, before, after, (float(start),) * 2, None)
+        return Outcome(stamps, before, after, (float(start), float(start)), None)
     label = f"tuning {chosen.name} ({stamps} times)"
     with experiment.timed(label), experiment.progress(label) as progress:
         tuned = tune(
             loss(arguments.loss, chosen, measurements, counted),
             {chosen.name: start},
             steps=arguments.steps,
+            optimizer=_optimizer(arguments.steps),
             transforms=chosen.transform,
             progress=progress,
         )
@@ -91,6 +100,12 @@ def _outcome(
         after = filtered(chosen, {**chosen.params, **tuned.params}, measurements)
     value = float(start), float(tuned.params[chosen.name])
     return Outcome(stamps, before, after, value, tuned.history)
+
+
+def _optimizer(steps: int) -> optax.GradientTransformation:
+    """Adam with a short memory: the loss can fall tenfold on the way, and steps that remember the
+    first gradients (b2 = 0.999) would stop short of the optimum."""
+    return optax.adam(optax.cosine_decay_schedule(0.1, steps), b2=0.9)
 
 
 def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:

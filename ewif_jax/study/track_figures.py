@@ -5,7 +5,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ewif_jax.study.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label
+from ewif_jax.study.figures import (
+    EWIF,
+    KALMAN,
+    MEASURED,
+    OTHER,
+    TRUTH,
+    canvas,
+    label,
+    legend_above,
+    plain_ticks,
+)
 from ewif_jax.study.tracks import Tracks, degrees
 
 MOST = 200
@@ -39,42 +49,42 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
 def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
     """Prediction error and NIS of every scored measurement over time."""
     figure, (above, below) = canvas(2, 1, width=10, height=6.5, sharex=True)
-    time = found.measurements.time
-    for axes, key, title in (
-        (above, "error", "prediction error [m]"),
-        (below, "nis", "NIS per component"),
+    time = np.asarray(found.measurements.time)
+    runs = [("", outcome.after, EWIF, "-")]
+    if outcome.history is not None:
+        runs = [(", before tuning", outcome.before, KALMAN, "--"), (", tuned", *runs[0][1:])]
+    for axes, key, statistic, word in (
+        (above, "error", np.median, "median"),
+        (below, "nis", np.mean, "mean"),
     ):
-        good = counted & np.isfinite(outcome.after[key]) & (outcome.after[key] > 0)
-        axes.semilogy(
-            time[good], outcome.after[key][good], ".", markersize=3, alpha=0.5, color=MEASURED,
-            label="one measurement",
-        )  # fmt: skip
-        runs = [("after", outcome.after, EWIF, "-")]
-        if outcome.history is not None:
-            runs.insert(0, ("before tuning", outcome.before, KALMAN, "--"))
+        good = counted & (outcome.after[key] > 0)
+        points = outcome.after[key][good]
+        axes.semilogy(time[good], points, ".", markersize=3, alpha=0.5, color=MEASURED)
+        axes.set_ylim(bottom=np.quantile(points, 0.01) / 2 if points.size else None)
         for text, run, color, style in runs:
             good = counted & np.isfinite(run[key])
-            middle = _binned(time[good], run[key][good], np.median if key == "error" else np.mean)
-            text = "median" if key == "error" else "mean"
-            suffix = "" if len(runs) == 1 else ", before" if color == KALMAN else ", tuned"
-            axes.plot(*middle, style, color=color, linewidth=1.8, label=text + suffix)
-        label(axes, "time since the track's start [s]" if axes is below else "", title)
+            middle = _binned(time[good], run[key][good], statistic)
+            axes.plot(*middle, style, color=color, linewidth=1.8, label=word + text)
+        plain_ticks(axes)
     below.axhline(1, color=TRUTH, linewidth=0.8, label="expected mean")
-    for axes in (above, below):
-        axes.legend(frameon=False, fontsize="small", ncols=4, loc="upper right")
+    legend_above(above)
+    legend_above(below)
+    label(above, "", "one-step prediction error [m]")
+    label(below, "time since the track's start [s]", "NIS per component")
     return figure
 
 
-def histories(outcomes: list[Any], name: str, unit: str) -> Figure:
+def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
     """Parameter and loss by gradient step."""
     figure, (left, right) = canvas(1, 2, width=10, height=4)
     for outcome, color in zip(outcomes, (EWIF, KALMAN), strict=False):
         text = f"{outcome.stamps} times: {outcome.value[1]:.3g} {unit}"
         left.semilogy(outcome.history["params"][name], color=color, label=text)
-        right.semilogy(outcome.history["loss"], color=color)
+        right.plot(outcome.history["loss"], color=color)
     left.legend(frameon=False, fontsize="small")
     label(left, "gradient step", f"{name} [{unit}]")
-    label(right, "gradient step", "loss")
+    label(right, "gradient step", loss)
+    plain_ticks(left)
     return figure
 
 
@@ -84,12 +94,12 @@ def _place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.nd
         where = degrees(found.origin[row], mean[here, :2])
         return where[:, 1], where[:, 0]
     if found.measurements.value.shape[-1] == 1:
-        return found.measurements.time[row, here], mean[here, 0]
+        return np.asarray(found.measurements.time)[row, here], mean[here, 0]
     return mean[here, 0], mean[here, 1]
 
 
 def _zoom(axes: Any, found: Tracks, estimate: dict[str, np.ndarray], row: int) -> None:
-    """Each axis of one track against time, less its straight line: what the filter has to follow."""
+    """Each axis of one track against time, less a straight line."""
     here = found.present[row]
     time, value = found.measurements.time[row, here], found.measurements.value[row, here]
     mean, sd = estimate["mean"][row, here], estimate["sd"][row, here]

@@ -16,7 +16,7 @@ from ewif_jax.study.experiment import Measured
 from ewif_jax.study.track_method import Method
 from ewif_jax.types import Measurement, Status
 
-WIDTH = 0.25
+WIDTH = 0.1
 """Of the smooth median, in units of the logarithm of the error."""
 
 
@@ -44,7 +44,8 @@ def smooth_median(length: Array) -> Array:
         jnp.min(fixed, where=known, initial=jnp.inf),
         jnp.max(fixed, where=known, initial=-jnp.inf),
     )
-    m = sum(lax.fori_loop(0, 60, halve, ends)) / 2
+    low, high = lax.fori_loop(0, 60, halve, ends)
+    m = (low + high) / 2
     slope = jax.grad(below)(m, fixed)
     # one Newton step that does not move m, through which the implicit derivative flows
     return jnp.exp(m - (below(m, logs) - below(m, fixed)) / slope)
@@ -84,7 +85,9 @@ def filtered(method: Method, params: Any, measurements: Measurement) -> dict[str
     found = run_batch(
         method.estimator, params, measurements, prior=method.prior, t0=0.0, observe=_seen, devices=1
     )
-    return {name: np.asarray(x) for name, x in found.items()}
+    arrays = {name: np.asarray(x) for name, x in found.items()}
+    components = np.maximum(np.sum(measurements.mask, -1), 1)
+    return {**arrays, "nis": arrays["nis"] / components}
 
 
 def report(found: dict[str, np.ndarray], counted: np.ndarray, seed: int) -> dict[str, Any]:
@@ -103,13 +106,12 @@ def report(found: dict[str, np.ndarray], counted: np.ndarray, seed: int) -> dict
 
 def _seen(step: Step, _: None) -> dict[str, Array]:
     info = step.info
-    present = jnp.maximum(jnp.sum(info.innovation != 0), 1).astype(info.innovation.dtype)
     return {
         "mean": step.mean,
         "sd": jnp.sqrt(jnp.diagonal(step.cov)),
         "innovation": info.innovation,
         "error": jnp.sqrt(jnp.sum(jnp.square(info.innovation))),
-        "nis": nis(info) / present,
+        "nis": nis(info),
         "status": info.status,
     }
 

@@ -1,6 +1,6 @@
 """Measurements of a file as one padded batch of tracks."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,8 @@ class Tracks(NamedTuple):
     """R tracks of at most T arrivals, each in order of arrival.
 
     name (R,); start (R,): time of the first arrival's measurement in seconds; origin (R, 2):
-    latitude and longitude of the local plane's origin, or None; measurements: times from the
+    latitude and longitude of the local plane's origin, or None; measurements: a `Measurement` of
+    NumPy arrays (R, T, ...), times from the
     start, values in metres; arrival (R, T): report times from the start; present (R, T): False is
     padding; line (R, T): in the file; dropped: how many rows were left out, by reason.
     """
@@ -23,7 +24,7 @@ class Tracks(NamedTuple):
     name: np.ndarray
     start: np.ndarray
     origin: np.ndarray | None
-    measurements: Measurement
+    measurements: Any
     arrival: np.ndarray
     present: np.ndarray
     line: np.ndarray
@@ -41,7 +42,7 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
         Refused: no track has `min_points` rows left.
     """
     values = [f"value{i}" for i in range(readings.value.shape[1])]
-    frame = pd.DataFrame(readings.value, columns=values).assign(
+    frame: Any = pd.DataFrame(readings.value, columns=values).assign(
         track=readings.track, sensor=readings.sensor, time=readings.time,
         arrival=readings.arrival, line=readings.line,
     )  # fmt: skip
@@ -68,21 +69,17 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
     value = _padded([place[0] for place in places], np.nan)
     present = _padded([np.ones(len(group), bool) for _, group in groups], False)
     time, arrival = (
-        _padded(
-            [
-                group[name].to_numpy() - first
-                for (_, group), first in zip(groups, start, strict=True)
-            ]
-        )
+        _padded([group[name].to_numpy() - group["time"].iloc[0] for _, group in groups])
         for name in ("time", "arrival")
     )
     code = [np.searchsorted(sensors, group["sensor"]).astype(np.int32) for _, group in groups]
     mask = np.isfinite(value) & present[..., None]
+    fields: Any = (time, np.where(mask, value, 0), _padded(code), mask)
     return Tracks(
         np.array([name for name, _ in groups]),
         start,
         origin,
-        Measurement(time, np.where(mask, value, 0), _padded(code), mask),
+        Measurement(*fields),
         arrival,
         present,
         _padded([group["line"].to_numpy() for _, group in groups]),

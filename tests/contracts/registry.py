@@ -42,9 +42,7 @@ def small_model() -> Model:
     def Q(params: Any, t0: Any, t1: Any) -> jax.Array:
         dt = t1 - t0
         cross = dt**2 / 2
-        return params["q"] * jnp.stack(
-            [jnp.stack([dt**3 / 3, cross]), jnp.stack([cross, dt])]
-        )
+        return params["q"] * jnp.stack([jnp.stack([dt**3 / 3, cross]), jnp.stack([cross, dt])])
 
     def b(params: Any, t0: Any, t1: Any) -> jax.Array:
         dt = t1 - t0

@@ -37,6 +37,4 @@ def test_linear_gaussian_filter():
     )
     np.testing.assert_allclose(trace.mean, theirs.filtered_means, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(trace.cov, theirs.filtered_covariances, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(
-        trace.info.log_likelihood.sum(), theirs.marginal_loglik, rtol=1e-9
-    )
+    np.testing.assert_allclose(trace.info.log_likelihood.sum(), theirs.marginal_loglik, rtol=1e-9)

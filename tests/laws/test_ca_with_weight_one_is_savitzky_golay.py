@@ -1,4 +1,4 @@
-"""Shulami & Sigalov, section IV-A.2: constant acceleration with W = 1 in a window is Savitzky-Golay."""
+"""Shulami & Sigalov, IV-A.2: constant acceleration with W = 1 in a window is Savitzky-Golay."""
 
 import numpy as np
 import pytest

@@ -3,11 +3,11 @@ P [sum W^4 A' H' R^-1 H A] P (ERRATA 5)."""
 
 import jax
 import numpy as np
-from laws.cases import case, close, model
 from oracles.wls import ewif_weight, true_cov
 
 import ewif_jax as ej
 from ewif_jax.models import position_sensor, random_walk
+from laws.cases import case, close, model
 
 FILTER = ej.ewif(model(), lambda p: p["tau"])
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import STEPS, case, close, model
 
 import ewif_jax as ej
+from laws.cases import STEPS, case, close, model
 
 FILTER = ej.ewif(model(), lambda p: p["tau"])
 

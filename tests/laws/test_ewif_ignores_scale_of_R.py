@@ -6,10 +6,10 @@ It holds without a prior, or with a prior scaled along (ERRATA 9).
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import case, close, model
 
 import ewif_jax as ej
 from ewif_jax import Gaussian
+from laws.cases import case, close, model
 
 FILTER = ej.ewif(model(), lambda p: p["tau"])
 

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import STEPS, case, close, model
 from oracles.kalman_loop import fading_filter
 
 import ewif_jax as ej
+from laws.cases import STEPS, case, close, model
 
 EWIF = ej.ewif(model(), lambda p: p["tau"])
 FADING = ej.fading(model(), inflation=lambda p, t0, t1: jnp.exp((t1 - t0) / p["tau"]))

@@ -1,11 +1,11 @@
-"""Shulami & Sigalov, section V-B: without process noise the Kalman filter is the EWIF with tau -> oo."""
+"""Shulami & Sigalov, V-B: without process noise the Kalman filter is the EWIF with tau -> oo."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import case, close, model
 
 import ewif_jax as ej
+from laws.cases import case, close, model
 
 EWIF = ej.ewif(model(), lambda p: p["tau"])
 KALMAN = ej.kalman(model())

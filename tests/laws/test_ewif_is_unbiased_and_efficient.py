@@ -4,9 +4,9 @@ noise itself is scaled by 1/W, its P is the covariance of the error (ERRATA 6)."
 import jax
 import numpy as np
 import pytest
-from laws.cases import STEPS, case, model
 
 import ewif_jax as ej
+from laws.cases import STEPS, case, model
 
 RUNS = 2000
 FILTER = ej.ewif(model(), lambda p: p["tau"])

@@ -59,7 +59,7 @@ def test_it_is_what_sampling_gives():
         shifted = stream._replace(value=value[:, None])
         return ej.run(EWIF, 0.5, shifted, prior=None, t0=0.0).mean[:, 0]
 
-    errors = np.mean((jax.jit(jax.vmap(mean))(values) - signal) ** 2, axis=1)
+    errors = np.mean((np.asarray(jax.jit(jax.vmap(mean))(values)) - signal) ** 2, axis=1)
     expected = root_mean(EWIF, 0.5, times, signal) ** 2
     assert abs(errors.mean() - expected) < 4 * errors.std() / np.sqrt(runs)
 
@@ -70,9 +70,7 @@ def test_its_minimum_is_the_published_one():
     stream = ej.stream(times, signal)
 
     def loss(tau):
-        mse = ej.expected_mse(
-            EWIF, tau, stream, signal[:, None], noise_cov=R, prior=None, t0=0.0
-        )
+        mse = ej.expected_mse(EWIF, tau, stream, signal[:, None], noise_cov=R, prior=None, t0=0.0)
         return jnp.sqrt(jnp.mean(mse))
 
     assert round(float(loss(0.4668)), 5) == 0.29964

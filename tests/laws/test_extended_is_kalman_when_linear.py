@@ -2,19 +2,17 @@
 
 import numpy as np
 import pytest
-from laws.cases import case, close, model
 from oracles.kalman_loop import kalman_filter
 
 import ewif_jax as ej
 from ewif_jax.models import bearing_sensor, constant_velocity
+from laws.cases import case, close, model
 
 
 def functions_only():
     """The same world, told as functions: its Jacobians are found by differentiation."""
     linear = model()
-    return ej.Model(
-        linear.transition, linear.process_cov, linear.observe, linear.measurement_cov
-    )
+    return ej.Model(linear.transition, linear.process_cov, linear.observe, linear.measurement_cov)
 
 
 @pytest.mark.parametrize("build", [model, functions_only])
@@ -35,14 +33,19 @@ def test_one_bearing_is_the_update_linearised_by_hand():
     P = np.diag([50.0, 30.0, 4.0, 4.0])
     world = constant_velocity(sensors=bearing_sensor(1e-4, (10.0, -20.0)), dims=2, q=0.2)
     z = np.arctan2(x[1] + 20.0, x[0] - 10.0) + 0.02
-    trace = ej.run(
-        ej.extended(world), None, ej.stream([0.0], [z]), prior=ej.Gaussian(x, P), t0=0.0
-    )
+    trace = ej.run(ej.extended(world), None, ej.stream([0.0], [z]), prior=ej.Gaussian(x, P), t0=0.0)
     dx, dy = x[0] - 10.0, x[1] + 20.0
     H = np.array([[-dy, dx, 0.0, 0.0]]) / (dx**2 + dy**2)
     offset = z - np.arctan2(dy, dx) + H @ x
     loop = kalman_filter(
-        t0=0.0, prior_mean=x, prior_cov=P, F=None, Q=None, times=[0.0], H=[H], R=[[[1e-4]]],
+        t0=0.0,
+        prior_mean=x,
+        prior_cov=P,
+        F=None,
+        Q=None,
+        times=[0.0],
+        H=[H],
+        R=[[[1e-4]]],
         values=[offset],
     )
     close(trace.mean[0], loop.means[0])

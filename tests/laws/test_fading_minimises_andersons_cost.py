@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from laws.cases import STEPS, case, close, model
 from oracles.kalman_loop import fading_filter, weighted_cost_minimiser
 
 import ewif_jax as ej
+from laws.cases import STEPS, case, close, model
 
 ALPHA = 1.15
 FILTER = ej.fading(model(), lambda p: p["fading"])

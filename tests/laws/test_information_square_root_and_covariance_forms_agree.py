@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import case, close, model
 from oracles.joint_gaussian import posterior
 
 import ewif_jax as ej
+from laws.cases import case, close, model
 
 COVARIANCE = ej.kalman(model())
 FORMS = {"information": ej.information(model()), "square_root": ej.square_root(model())}

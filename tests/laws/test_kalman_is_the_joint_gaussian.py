@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from laws.cases import STEPS, case, close, model
 from oracles.joint_gaussian import log_likelihood, posterior
 
 import ewif_jax as ej
 from ewif_jax import Gaussian
+from laws.cases import STEPS, case, close, model
 
 FILTER = ej.kalman(model())
 

@@ -6,10 +6,10 @@ W = exp(g(t_l) - g(t_k)) for any g has them; g = t / 2 tau is the EWIF, g = 0 pl
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws.cases import STEPS, case, close, model
 from oracles.wls import batch_wls
 
 import ewif_jax as ej
+from laws.cases import STEPS, case, close, model
 
 GROWTH = {
     "W = 1": lambda xp, t: 0.0 * t,

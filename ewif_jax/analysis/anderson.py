@@ -1,0 +1,200 @@
+"""What exponential data weighting does to a discrete filter: Anderson (1973), section 5."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.analysis.riccati import gain
+from ewif_jax.analysis.stabilising import discrete_lyapunov, stabilising_dare
+from ewif_jax.analysis.stability import require_steady_state
+
+
+class System(NamedTuple):
+    """x(k) = F x(k-1) + w, z(k) = H x(k) + v: F (n, n), H (m, n), Q = cov w (n, n), R = cov v
+    (m, m); each constant, or stacked (T, ...) with entry k for the step into measurement k.
+
+    Anderson's H' is H here, and his G Q G' is Q.
+    """
+
+    F: Array
+    H: Array
+    Q: Array
+    R: Array
+
+
+class Weighted(NamedTuple):
+    """The covariances a filter computes: predicted (T, n, n), cov (T, n, n), gain (T, n, m)."""
+
+    predicted: Array
+    cov: Array
+    gain: Array
+
+
+class Bounds(NamedTuple):
+    """best <= error <= design (5-18), each (T, n, n): what the optimal filter achieves, what the
+    weighted one achieves, and what the weighted one believes."""
+
+    best: Array
+    error: Array
+    design: Array
+
+
+class SteadyState(NamedTuple):
+    """predicted, cov, error (n, n), gain (n, m), closed_loop (n, n): the matrix F (I - K H) by
+    which an error is carried from step to step."""
+
+    predicted: Array
+    cov: Array
+    error: Array
+    gain: Array
+    closed_loop: Array
+
+
+def weighted_covariances(system: System, cov0: Array, *, fading: Array, steps: int) -> Weighted:
+    r"""The covariances and gains of the exponentially weighted filter, without data.
+
+    .. math::
+        \hat\Pi(k) &= \alpha^2 F \Pi(k-1) F' + Q \quad (5\text{-}14) \\
+        K(k) &= \hat\Pi H' (H \hat\Pi H' + R)^{-1} \quad (5\text{-}13) \\
+        \Pi(k) &= (I - K H) \hat\Pi (I - K H)' + K R K' \quad (5\text{-}15)
+
+    Args:
+        system: what the filter is designed for.
+        cov0: Pi(k0) = P0 (n, n).
+        fading: alpha >= 1, () or (T,).
+        steps: T.
+
+    Reduces to: the Kalman filter for alpha = 1.
+    """
+    checks.at_least("fading", fading, 1.0)
+    cov0 = jnp.asarray(cov0)
+
+    def body(cov: Array, step: tuple[System, Array]) -> tuple[Array, Weighted]:
+        (F, H, Q, R), alpha = step
+        predicted = _symmetric(alpha**2 * F @ cov @ F.T + Q)
+        K = gain(predicted, H, R)
+        cov = _updated(predicted, K, H, R)
+        return cov, Weighted(predicted, cov, K)
+
+    alphas = jnp.broadcast_to(jnp.asarray(fading, cov0.dtype), (steps,))
+    return lax.scan(body, cov0, (_stacked(system, steps), alphas))[1]
+
+
+def actual_error(
+    gain: Array,
+    system: System,
+    cov0: Array,
+    *,
+    design: System | None = None,
+    mean0: Array | None = None,
+) -> Array:
+    r"""The actual mean square error E (T, n, n) after each update with the given gains.
+
+    .. math::
+        \hat{\mathcal E}(k) &= F \mathcal E(k-1) F' + Q \quad (5\text{-}19) \\
+        \mathcal E(k) &= (I - K H) \hat{\mathcal E} (I - K H)' + K R K' \quad (5\text{-}20)
+
+    Args:
+        gain: K (T, n, m), of whatever filter.
+        system: the true system.
+        cov0: covariance (n, n) of the true initial state around the filter's.
+        design: the system whose F and H the filter uses, if not the true ones. The error then
+            depends on the state itself, so the second moments of state and estimate are carried.
+        mean0: true mean of the initial state (n,), default 0; it matters with a `design` only, the
+            estimate being assumed to start there.
+
+    Deviations: the second bracket of (5-20) is printed without its transpose.
+    """
+    gain, cov0 = jnp.asarray(gain), jnp.asarray(cov0)
+    steps, n = gain.shape[:2]
+    truth = _stacked(system, steps)
+    if design is None:
+
+        def body(E: Array, step: tuple[System, Array]) -> tuple[Array, Array]:
+            (F, H, Q, R), K = step
+            E = _updated(F @ E @ F.T + Q, K, H, R)
+            return E, E
+
+        return lax.scan(body, cov0, (truth, gain))[1]
+    mean = jnp.zeros(n, cov0.dtype) if mean0 is None else jnp.asarray(mean0)
+    away = jnp.outer(mean, mean)
+    moments = jnp.block([[cov0 + away, away], [away, away]])
+
+    def both(S: Array, step: tuple[System, System, Array]) -> tuple[Array, Array]:
+        (F, H, Q, R), (F_used, H_used, _, _), K = step
+        seen = K @ H
+        kept = F_used - K @ H_used @ F_used
+        move = jnp.block([[F, jnp.zeros_like(F)], [seen @ F, kept]])
+        noise = jnp.block([[Q, Q @ seen.T], [seen @ Q, seen @ Q @ seen.T + K @ R @ K.T]])
+        S = _symmetric(move @ S @ move.T + noise)
+        return S, S[:n, :n] - S[:n, n:] - S[n:, :n] + S[n:, n:]
+
+    return lax.scan(both, moments, (truth, _stacked(design, steps), gain))[1]
+
+
+def error_bounds(system: System, cov0: Array, *, fading: Array, steps: int) -> Bounds:
+    r"""The bounds :math:`P(k) \le \mathcal E(k) \le \Pi_\alpha(k)` (5-18), all three.
+
+    Arguments as in `weighted_covariances`. Equal throughout for alpha = 1.
+    """
+    design = weighted_covariances(system, cov0, fading=fading, steps=steps)
+    best = weighted_covariances(system, cov0, fading=jnp.ones(()), steps=steps).cov
+    return Bounds(best, actual_error(design.gain, system, cov0), design.cov)
+
+
+def weighting_as_process_noise(F: Array, Q: Array, cov: Array, fading: Array) -> Array:
+    r"""The process noise (..., n, n) with which a filter *without* weighting has the same gains.
+
+    .. math:: Q + (\alpha^2 - 1) F(k-1) \Pi_\alpha(k-1) F'(k-1) \quad (5\text{-}16)
+
+    Args:
+        F, Q: of the step into k, (..., n, n).
+        cov: Pi(k-1), (..., n, n): known only once the weighted filter has been designed.
+        fading: alpha, () or (...).
+
+    Deviations: (5-16) prints Pi(k) for Pi(k-1).
+    """
+    F, cov = jnp.asarray(F), jnp.asarray(cov)
+    extra = jnp.square(jnp.asarray(fading))[..., None, None] - 1
+    return Q + extra * (F @ cov @ jnp.swapaxes(F, -1, -2))
+
+
+def steady_state(system: System, *, fading: Array = 1.0) -> SteadyState:  # type: ignore[assignment]
+    r"""The stationary weighted filter of a constant system, and its actual error.
+
+    :math:`\hat\Pi` solves the Riccati equation with :math:`\alpha F` in the place of F; the error
+    is the stationary solution of (5-19)-(5-20). Every eigenvalue of the closed loop lies within
+    :math:`1/\alpha`. Differentiable in the matrices and in `fading`, by the implicit function
+    theorem. `fading` = exp(dt / 2 tau) with Q = 0 gives the EWIF's.
+
+    Raises:
+        ValueError: fading < 1; there is no such state: a mode that does not decay is not seen, or
+            a mode that neither grows nor decays is not driven.
+    """
+    checks.at_least("fading", fading, 1.0)
+    F, H, Q, R = (jnp.asarray(x) for x in system)
+    weighted = jnp.asarray(fading, F.dtype) * F
+    require_steady_state(weighted, H, Q, on_edge=lambda values: np.abs(values) - 1)
+    predicted = stabilising_dare(weighted, H, Q, R)
+    K = gain(predicted, H, R)
+    left = jnp.eye(F.shape[0], dtype=F.dtype) - K @ H
+    error = discrete_lyapunov(left @ F, left @ Q @ left.T + K @ R @ K.T)
+    return SteadyState(predicted, _updated(predicted, K, H, R), error, K, F @ left)
+
+
+def _updated(predicted: Array, K: Array, H: Array, R: Array) -> Array:
+    left = jnp.eye(K.shape[0], dtype=K.dtype) - K @ H
+    return _symmetric(left @ predicted @ left.T + K @ R @ K.T)
+
+
+def _symmetric(x: Array) -> Array:
+    return (x + x.T) / 2
+
+
+def _stacked(system: System, steps: int) -> System:
+    """Every matrix stacked (T, ...)."""
+    arrays = (jnp.asarray(x) for x in system)
+    return System(*(x if x.ndim == 3 else jnp.broadcast_to(x, (steps, *x.shape)) for x in arrays))

@@ -1,0 +1,86 @@
+"""What exponential data weighting does to a continuous filter: Anderson (1973), section 4."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.analysis.stabilising import continuous_lyapunov, stabilising_care
+from ewif_jax.analysis.stability import require_steady_state
+
+
+class ContinuousSystem(NamedTuple):
+    """dx = F x dt + G dw, z = H x + v: F (n, n), G (n, p), H (m, n), and the spectral densities
+    Q (p, p) of the input and R (m, m) of the measurement noise. Anderson's H' is H here.
+
+    For `kalman_bucy` each may be a function (params, t).
+    """
+
+    F: Array
+    G: Array
+    H: Array
+    Q: Array
+    R: Array
+
+
+class ContinuousSteadyState(NamedTuple):
+    """cov: Pi, error: E (n, n), gain (n, m), closed_loop: F - K H (n, n)."""
+
+    cov: Array
+    error: Array
+    gain: Array
+    closed_loop: Array
+
+
+def steady_state_continuous(
+    system: ContinuousSystem,
+    *,
+    fading_rate: Array = 0.0,  # type: ignore[assignment]
+) -> ContinuousSteadyState:
+    r"""The stationary weighted Kalman-Bucy filter of a constant system, and its actual error.
+
+    .. math::
+        0 &= \Pi (F' + \alpha I) + (F + \alpha I) \Pi - \Pi H' R^{-1} H \Pi + G Q G'
+            \quad (4\text{-}2) \\
+        0 &= (F - K H) \mathcal E + \mathcal E (F - K H)' + G Q G' + K R K'
+            \quad (4\text{-}10), \quad K = \Pi H' R^{-1}
+
+    All eigenvalues of F - K H have real parts of at most :math:`-\alpha`. Differentiable in the
+    matrices and in alpha, by the implicit function theorem.
+
+    Args:
+        system: constant matrices.
+        fading_rate: alpha >= 0 in 1/s; 1 / (2 tau) with Q = 0 gives the EWIF's limit.
+
+    Raises:
+        ValueError: fading_rate < 0; there is no such state: a mode that does not decay is not
+            seen, or a mode that neither grows nor decays is not driven.
+    """
+    checks.at_least("fading_rate", fading_rate, 0.0)
+    F, G, H, Q, R = (jnp.asarray(x) for x in system)
+    noise = G @ Q @ G.T
+    weighted = F + jnp.asarray(fading_rate, F.dtype) * jnp.eye(F.shape[0], dtype=F.dtype)
+    require_steady_state(weighted, H, noise, on_edge=np.real)
+    cov = stabilising_care(weighted, H, noise, R)
+    K = jnp.linalg.solve(R, H @ cov).T
+    closed_loop = F - K @ H
+    error = continuous_lyapunov(closed_loop, noise + K @ R @ K.T)
+    return ContinuousSteadyState(cov, error, K, closed_loop)
+
+
+def weighting_as_input_noise(noise: Array, cov: Array, fading_rate: Array) -> Array:
+    r"""The input noise (..., n, n) with which a filter *without* weighting has the same gains.
+
+    .. math:: G Q G' + 2 \alpha \Pi_\alpha \quad (4\text{-}7)
+
+    Args:
+        noise: G Q G' (..., n, n).
+        cov: Pi (..., n, n) at the same time.
+        fading_rate: alpha in 1/s, () or (...).
+
+    Deviations: the first terms of (4-7) are printed as Pi F + F' Pi for Pi F' + F Pi, and the text
+        after it says measurement noise for input noise.
+    """
+    return noise + 2 * jnp.asarray(fading_rate)[..., None, None] * jnp.asarray(cov)

@@ -1,0 +1,123 @@
+"""Stabilising solutions of Riccati equations, also where no noise drives a growing mode.
+
+With exponential weighting and little or no process noise the equation has several solutions, and
+an iteration from Q finds the smallest, which may be zero. Here a filter that is certainly stable
+(designed with more noise) comes first, and Newton's method leads from it to the wanted solution.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax.analysis.riccati import dare, gain, riccati_step
+from ewif_jax.kernels import cholesky
+
+NEWTON_STEPS = 60
+
+
+def stabilising_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    r"""The solution P (n, n) whose filter is stable; NaN where there is none.
+
+    .. math::
+        P = F (P - P H' (H P H' + R)^{-1} H P) F' + Q
+
+    Newton's method (Hewer 1971). Derivatives come from the implicit function theorem.
+    """
+
+    def guess(Q: Array) -> Array:
+        return dare(F, H, Q, R)
+
+    def refined(P: Array) -> Array:
+        FK = F @ gain(P, H, R)
+        return discrete_lyapunov(F - FK @ H, FK @ R @ FK.T + Q)
+
+    def defect(P: Array) -> Array:
+        return riccati_step(P, F, H, Q, R) - P
+
+    return _root(defect, guess, refined, Q)
+
+
+def stabilising_care(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    r"""The solution P (n, n) whose filter is stable; NaN where there is none.
+
+    .. math::
+        F P + P F' - P H' R^{-1} H P + Q = 0
+
+    Newton's method (Kleinman 1968) from a solution by Cayley transformation and doubling (Chu, Fan
+    & Lin 2005). Derivatives come from the implicit function theorem.
+    """
+    looking = jnp.linalg.solve(R, H)
+    G = H.T @ looking
+
+    def guess(Q: Array) -> Array:
+        return dare(*_cayley(F, G, Q))
+
+    def refined(P: Array) -> Array:
+        K = P @ looking.T
+        return continuous_lyapunov(F - K @ H, K @ R @ K.T + Q)
+
+    def defect(P: Array) -> Array:
+        return F @ P + P @ F.T - P @ G @ P + Q
+
+    return _root(defect, guess, refined, Q)
+
+
+def discrete_lyapunov(A: Array, Q: Array) -> Array:
+    """X (n, n) with X = A X A' + Q."""
+    return _linear(A, Q, jnp.eye(A.shape[0] ** 2, dtype=A.dtype) - jnp.kron(A, A))
+
+
+def continuous_lyapunov(A: Array, Q: Array) -> Array:
+    """X (n, n) with A X + X A' + Q = 0."""
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    return _linear(A, Q, -jnp.kron(A, eye) - jnp.kron(eye, A))
+
+
+def _linear(A: Array, Q: Array, matrix: Array) -> Array:
+    X = jnp.linalg.solve(matrix, Q.reshape(-1)).reshape(A.shape)
+    return (X + X.T) / 2
+
+
+def _cayley(F: Array, G: Array, Q: Array) -> tuple[Array, Array, Array, Array]:
+    """The discrete problem (F, H, Q, R) with the same stabilising solution."""
+    eye = jnp.eye(F.shape[0], dtype=F.dtype)
+    size = jnp.linalg.norm(F) + jnp.sqrt(jnp.linalg.norm(G) * jnp.linalg.norm(Q))
+    shift = 1.1 * size + jnp.finfo(F.dtype).tiny
+    inner = jnp.linalg.inv(F.T - shift * eye)
+    outer = jnp.linalg.inv((F.T - shift * eye).T + Q @ inner @ G)
+    seen = 2 * shift * inner @ G @ outer
+    noise = 2 * shift * outer @ Q @ inner
+    look = cholesky.factor((seen + seen.T) / 2).lower.T
+    return eye + 2 * shift * outer, look, (noise + noise.T) / 2, eye
+
+
+def _root(
+    defect: Callable[[Array], Array],
+    guess: Callable[[Array], Array],
+    refined: Callable[[Array], Array],
+    Q: Array,
+) -> Array:
+    """The zero of `defect` that `refined` converges to from `guess` of a larger Q."""
+    tolerance = 8 * Q.shape[0] * float(jnp.finfo(Q.dtype).eps)
+
+    def going(carry: tuple[Array, Array, Array]) -> Array:
+        count, change, P = carry
+        return (count < NEWTON_STEPS) & (change > tolerance * jnp.max(jnp.abs(P)))
+
+    def once(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, _, P = carry
+        better = refined(P)
+        return count + 1, jnp.max(jnp.abs(better - P)), better
+
+    def solve(_: object, start: Array) -> Array:
+        P = guess(start + (1 + jnp.max(jnp.abs(start))) * jnp.eye(Q.shape[0], dtype=Q.dtype))
+        first = (jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, Q.dtype), P)
+        return lax.while_loop(going, once, first)[2]
+
+    def tangent_solve(linear: Callable[[Array], Array], y: Array) -> Array:
+        matrix = jax.jacfwd(linear)(jnp.zeros_like(y)).reshape(y.size, y.size)
+        return jnp.linalg.solve(matrix, y.reshape(-1)).reshape(y.shape)
+
+    return lax.custom_root(defect, Q, solve, tangent_solve)  # type: ignore[arg-type]

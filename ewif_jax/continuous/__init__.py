@@ -1,0 +1,1 @@
+"""Filters in continuous time, whose measurements are a signal."""

@@ -1,0 +1,71 @@
+"""The actual error of a Kalman-Bucy filter while it settles."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.analysis.anderson_continuous import ContinuousSystem
+from ewif_jax.continuous.kalman_bucy import matrices, solve
+from ewif_jax.kernels import symmetric
+
+
+class ErrorCurve(NamedTuple):
+    """time (K,), error: E (K, n, n), what happens, and design: Pi (K, n, n), what is believed."""
+
+    time: Array
+    error: Array
+    design: Array
+
+
+def actual_error_continuous(
+    system: ContinuousSystem,
+    params: Any,
+    cov0: Any,
+    *,
+    times: Any,
+    fading_rate: Any = 0.0,
+    truth: ContinuousSystem | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 16_384,
+) -> ErrorCurve:
+    r"""The actual mean square error of the weighted filter.
+
+    .. math::
+        \dot{\mathcal E} = (F - K H) \mathcal E + \mathcal E (F - K H)' + G Q G' + K R K'
+        \quad (4\text{-}9), \qquad K = \Pi_\alpha H' R^{-1}
+
+    Anderson (1973), section 4. G Q G' and R are the true ones, K is of the filter's design.
+
+    Args:
+        system: what the filter is designed for; `kalman_bucy` describes it and `fading_rate`.
+        params: what its functions are read from.
+        cov0: E and Pi (n, n) at times[0].
+        times: (K,) increasing seconds.
+        truth: the system whose noises are real, default `system`. Its F and H must be those of the
+            design (then the error does not depend on the state).
+        rtol, atol, max_steps: of the solver, as in `kalman_bucy`.
+
+    Reduces to: E = Pi for alpha = 0 and a true design; P <= E <= Pi (4-11) otherwise.
+    """
+    checks.psd("cov0", cov0)
+    checks.shape("times", times, ("K",))
+    cov0 = jnp.asarray(cov0)
+    used = matrices(system, params, fading_rate, cov0.dtype)
+    real = matrices(system if truth is None else truth, params, 0.0, cov0.dtype)
+
+    def field(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        error, cov = (symmetric.unpack(x) for x in state)
+        now, world = used(t), real(t)
+        K = now.gain(cov)
+        moved = (now.F - K @ now.H) @ error
+        slope = moved + moved.T + world.noise + K @ world.R @ K.T
+        return symmetric.pack(slope), symmetric.pack(now.slope(cov))
+
+    start = symmetric.pack(cov0), symmetric.pack(cov0)
+    times = jnp.asarray(times, cov0.dtype)
+    error, design = solve(field, start, times, rtol, atol, max_steps)
+    return ErrorCurve(times, jax.vmap(symmetric.unpack)(error), jax.vmap(symmetric.unpack)(design))

@@ -1,0 +1,179 @@
+"""The Kalman-Bucy filter, with or without exponential data weighting."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.analysis.anderson_continuous import ContinuousSystem
+from ewif_jax.kernels import symmetric
+from ewif_jax.types import Gaussian
+
+
+class Signal(NamedTuple):
+    """A measured signal: time (S,) increasing seconds, value (S, m), linear in between."""
+
+    time: Array
+    value: Array
+
+
+class Filtered(NamedTuple):
+    """time (K,), mean (K, n), cov (K, n, n): Pi, and gain (K, n, m) = Pi H' R^-1."""
+
+    time: Array
+    mean: Array
+    cov: Array
+    gain: Array
+
+
+def kalman_bucy(
+    system: ContinuousSystem,
+    params: Any,
+    signal: Signal,
+    *,
+    prior: Gaussian,
+    times: Any,
+    fading_rate: Any = 0.0,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 16_384,
+) -> Filtered:
+    r"""Estimates at the given times from a measured signal.
+
+    .. math::
+        \dot{\hat x} &= F \hat x + \Pi H' R^{-1} (z - H \hat x) \quad (3\text{-}5), (4\text{-}3) \\
+        \dot\Pi &= \Pi (F + \alpha I)' + (F + \alpha I) \Pi - \Pi H' R^{-1} H \Pi + G Q G'
+            \quad (4\text{-}2)
+
+    Anderson (1973), sections 3 and 4, with H for his H'. :math:`\Pi = e^{2 \int \alpha} P_\alpha`
+    stays bounded where the :math:`P_\alpha` of (3-4) and its noise covariances do not, and gives
+    the same estimate. Solved by diffrax (Tsitouras 5/4, adaptive) with its adjoint, so it is
+    differentiable in `params`, the signal and the prior.
+
+    Args:
+        system: F, G, H, Q, R, each a constant or a function (params, t).
+        params: what they are read from.
+        signal: z, sampled; the estimate is driven by its linear interpolation.
+        prior: Gaussian at times[0].
+        times: (K,) increasing seconds within the signal; the first is the start.
+        fading_rate: alpha >= 0 in 1/s, a constant or a function (params, t).
+        rtol, atol: tolerances of the solver; default by dtype (1e-9 and 1e-11 in float64).
+        max_steps: of the solver; exceeding it is an error.
+
+    Raises:
+        ValueError: shapes, times that do not increase or leave the signal, fading_rate < 0.
+        ImportError: diffrax is not installed.
+
+    Reduces to: the filter without weighting for alpha = 0; `steady_state_continuous` as time grows.
+
+    Deviations: alpha may vary with time, as the paper allows after (2-8).
+    """
+    checks.prior(checks.needs_prior(prior, "kalman_bucy"))
+    _check_times(signal, times)
+    if not callable(fading_rate):
+        checks.at_least("fading_rate", fading_rate, 0.0)
+    dtype = jnp.asarray(signal.value).dtype
+    at = matrices(system, params, fading_rate, dtype)
+    stamps, values = jnp.asarray(signal.time, dtype), jnp.asarray(signal.value)
+
+    def field(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        mean, cov = state[0], symmetric.unpack(state[1])
+        now = at(t)
+        K = now.gain(cov)
+        z = jax.vmap(lambda v: jnp.interp(t, stamps, v), in_axes=1)(values)
+        return now.F @ mean + K @ (z - now.H @ mean), symmetric.pack(now.slope(cov))
+
+    start = jnp.asarray(prior.mean, dtype), symmetric.pack(jnp.asarray(prior.cov, dtype))
+    times = jnp.asarray(times, dtype)
+    mean, packed = solve(field, start, times, rtol, atol, max_steps)
+    cov = jax.vmap(symmetric.unpack)(packed)
+    gains = jax.vmap(lambda t, P: at(t).gain(P))(times, cov)
+    return Filtered(times, mean, cov, gains)
+
+
+class Instant(NamedTuple):
+    """The matrices at one time; noise is G Q G'."""
+
+    F: Array
+    H: Array
+    noise: Array
+    R: Array
+    fading_rate: Array
+
+    def gain(self, cov: Array) -> Array:
+        """Pi H' R^-1, (n, m)."""
+        return jnp.linalg.solve(self.R, self.H @ cov).T
+
+    def slope(self, cov: Array) -> Array:
+        """The right-hand side of (4-2), (n, n)."""
+        K = self.gain(cov)
+        moved = self.F @ cov
+        return moved + moved.T + 2 * self.fading_rate * cov - K @ self.R @ K.T + self.noise
+
+
+def matrices(
+    system: ContinuousSystem, params: Any, fading_rate: Any, dtype: Any
+) -> Callable[[Array], Instant]:
+    """The system's matrices as a function of time."""
+
+    def at(t: Array) -> Instant:
+        def read(x: Any) -> Array:
+            return jnp.asarray(x(params, t) if callable(x) else x, dtype)
+
+        F, G, H, Q, R = (read(x) for x in system)
+        return Instant(F, H, G @ Q @ G.T, R, read(fading_rate))
+
+    return at
+
+
+def solve(
+    field: Callable[[Array, Any], Any],
+    start: Any,
+    times: Array,
+    rtol: float | None,
+    atol: float | None,
+    max_steps: int,
+) -> Any:
+    """The solution of d state / dt = field(t, state) at `times`, stacked, from `start` at the
+    first of them."""
+    try:
+        import diffrax
+    except ImportError as missing:
+        raise ImportError(
+            "continuous-time filters need diffrax: pip install 'ewif_jax[continuous]'"
+        ) from missing
+    double = times.dtype == jnp.float64
+    tolerances = diffrax.PIDController(
+        rtol=rtol or (1e-9 if double else 1e-5), atol=atol or (1e-11 if double else 1e-7)
+    )
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: field(t, y)),
+        diffrax.Tsit5(),
+        times[0],
+        times[-1],
+        None,
+        start,
+        saveat=diffrax.SaveAt(ts=times),
+        stepsize_controller=tolerances,
+        max_steps=max_steps,
+    ).ys
+
+
+def _check_times(signal: Signal, times: Any) -> None:
+    checks.shape("signal.time", signal.time, ("S",))
+    checks.shape("signal.value", signal.value, (jnp.shape(signal.time)[0], "m"))
+    checks.shape("times", times, ("K",))
+    known, samples = checks.known(times), checks.known(signal.time)
+    for name, value in (("times", known), ("signal.time", samples)):
+        if value is not None:
+            checks.finite(name, value)
+            increasing = value.size > 1 and bool((value[1:] > value[:-1]).all())
+            checks.require(increasing, name, "at least two increasing times", value)
+    if known is not None and samples is not None:
+        inside = samples[0] <= known[0] and known[-1] <= samples[-1]
+        checks.require(
+            inside, "times", f"times within the signal's {samples[0]} to {samples[-1]}", known
+        )
