@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.experimental.layout import Format, Layout
+from jax.experimental.layout import Format, Layout, with_layout_constraint
 from jax.extend.core import Literal
 from jax.sharding import Mesh, PartitionSpec
 
@@ -84,7 +84,8 @@ def run_batch(
     first = jax.tree.map(lambda x, f: x[0] if f else x, inputs, input_flags)
     validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
     keys = None if key is None else jax.random.split(key, runs)
-    return _run_batch(
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((inputs, t0, keys)))
+    return (_run_batch if traced else _run_batch_in_place)(
         estimator,
         inputs,
         t0,
@@ -154,9 +155,9 @@ def scan_batch(
             body, (params_f, state_f, arrival_f), force=(state_f, None)
         )(params, state, arrival)
         flags_out.append(seen_f)
-        return state, seen
+        return _contiguous(state, state_f), seen
 
-    state, seen = lax.scan(scanned, state, arrivals)
+    state, seen = lax.scan(scanned, _contiguous(state, state_f), arrivals)
     return (seen, flags_out[-1]), (state, state_f)
 
 
@@ -272,7 +273,7 @@ def _batched(
     params, measurements, prior, times = inputs
     dtype = float_dtype(measurements.value)
     runs = measurements.value.shape[0]
-    measurements = runs_last(_cast(measurements, dtype, flags.tree[1]), flags.tree[1])
+    measurements = runs_last(_in_dtype(measurements, dtype), flags.tree[1])
     times = None if times is None else jnp.asarray(times, dtype)
     others = runs_last(
         (params, prior, times), (flags.tree[0], flags.tree[2], flags.tree[3])
@@ -308,11 +309,13 @@ _run_batch_in_place = jax.jit(
 )
 
 
-def _cast(measurements: Measurement, dtype: Any, flags: Measurement) -> Measurement:
-    shared_mask = flags.value and not flags.mask
-    mask = jnp.asarray(measurements.mask, bool)
-    whole = measurements._replace(mask=mask[None] if shared_mask else mask)
-    return cast(whole, dtype)._replace(mask=mask)
+def _in_dtype(measurements: Measurement, dtype: Any) -> Measurement:
+    return Measurement(
+        jnp.asarray(measurements.time, dtype),
+        jnp.asarray(measurements.value, dtype),
+        jnp.asarray(measurements.sensor, jnp.int32),
+        jnp.asarray(measurements.mask, bool),
+    )
 
 
 def _prior_flags(prior: Gaussian) -> Gaussian:
@@ -321,6 +324,15 @@ def _prior_flags(prior: Gaussian) -> Gaussian:
 
 def _spread(x: Array, runs: int) -> Array:
     return jnp.broadcast_to(x[..., None], (*x.shape, runs))
+
+
+def _contiguous(tree: Any, flags: Any) -> Any:
+    """The flagged leaves with the runs adjacent in memory, which the compiler may see otherwise."""
+
+    def kept(x: Array, flag: bool) -> Array:
+        return with_layout_constraint(x, Layout(tuple(range(x.ndim)))) if flag else x
+
+    return jax.tree.map(kept, tree, flags)
 
 
 def _spec(last: int, flag: bool) -> PartitionSpec:

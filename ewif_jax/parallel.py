@@ -139,9 +139,9 @@ def _run_parallel(
     stretches, _ = lax.scan(lambda s, m: (all_blocks(lengthen)(s, m), None), empty, arrivals)
     stretches = jax.tree.map(_leading, stretches)
     carried_in = jax.tree.map(_trailing, _carried_in(start, stretches, after, method))
-    final, trace = lax.scan(all_blocks(filtered), carried_in, (arrivals, reports))
-    trace = jax.tree.map(lambda x: _joined_blocks(x)[:steps], trace)
-    return Trace(*trace, jax.tree.map(lambda x: x[..., -1], final))
+    final, outputs = lax.scan(all_blocks(filtered), carried_in, (arrivals, reports))
+    time, mean, cov, info = jax.tree.map(lambda x: _joined_blocks(x)[:steps], outputs)
+    return Trace(time, mean, cov, info, jax.tree.map(lambda x: x[..., -1], final))
 
 
 def _carried_in(

@@ -20,7 +20,7 @@ RANKS = (
     {"forms", "batch"},
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},
-    {"scores"},
+    {"scores", "continuous"},
     {"tuning", "monte_carlo"},
     {"scenarios"},
     {"study"},

@@ -1,7 +1,9 @@
 """What exponential data weighting does to a discrete filter: Anderson (1973), section 5."""
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -70,8 +72,11 @@ def weighted_covariances(system: System, cov0: Array, *, fading: Array, steps: i
     Reduces to: the Kalman filter for alpha = 1.
     """
     checks.at_least("fading", fading, 1.0)
-    cov0 = jnp.asarray(cov0)
+    return _weighted_covariances(system, jnp.asarray(cov0), fading, steps)
 
+
+@partial(jax.jit, static_argnames="steps")
+def _weighted_covariances(system: System, cov0: Array, fading: Array, steps: int) -> Weighted:
     def body(cov: Array, step: tuple[System, Array]) -> tuple[Array, Weighted]:
         (F, H, Q, R), alpha = step
         predicted = _symmetric(alpha**2 * F @ cov @ F.T + Q)
@@ -108,7 +113,13 @@ def actual_error(
 
     Deviations: the second bracket of (5-20) is printed without its transpose.
     """
-    gain, cov0 = jnp.asarray(gain), jnp.asarray(cov0)
+    return _actual_error(jnp.asarray(gain), system, jnp.asarray(cov0), design, mean0)
+
+
+@jax.jit
+def _actual_error(
+    gain: Array, system: System, cov0: Array, design: System | None, mean0: Array | None
+) -> Array:
     steps, n = gain.shape[:2]
     truth = _stacked(system, steps)
     if design is None:
@@ -146,20 +157,18 @@ def error_bounds(system: System, cov0: Array, *, fading: Array, steps: int) -> B
 
 
 def weighting_as_process_noise(F: Array, Q: Array, cov: Array, fading: Array) -> Array:
-    r"""The process noise (..., n, n) with which a filter *without* weighting has the same gains.
+    r"""The process noise (n, n) with which a filter *without* weighting has the same gains.
 
     .. math:: Q + (\alpha^2 - 1) F(k-1) \Pi_\alpha(k-1) F'(k-1) \quad (5\text{-}16)
 
     Args:
-        F, Q: of the step into k, (..., n, n).
-        cov: Pi(k-1), (..., n, n): known only once the weighted filter has been designed.
-        fading: alpha, () or (...).
+        F, Q: of the step into k, (n, n).
+        cov: Pi(k-1), (n, n): known only once the weighted filter has been designed.
+        fading: alpha, ().
 
     Deviations: (5-16) prints Pi(k) for Pi(k-1).
     """
-    F, cov = jnp.asarray(F), jnp.asarray(cov)
-    extra = jnp.square(jnp.asarray(fading))[..., None, None] - 1
-    return Q + extra * (F @ cov @ jnp.swapaxes(F, -1, -2))
+    return Q + (jnp.square(fading) - 1) * (F @ jnp.asarray(cov) @ F.T)
 
 
 def steady_state(system: System, *, fading: Array = 1.0) -> SteadyState:  # type: ignore[assignment]
@@ -178,6 +187,12 @@ def steady_state(system: System, *, fading: Array = 1.0) -> SteadyState:  # type
     F, H, Q, R = (jnp.asarray(x) for x in system)
     weighted = jnp.asarray(fading, F.dtype) * F
     require_steady_state(weighted, H, Q, on_edge=lambda values: np.abs(values) - 1)
+    return _steady_state(System(F, H, Q, R), weighted)
+
+
+@jax.jit
+def _steady_state(system: System, weighted: Array) -> SteadyState:
+    F, H, Q, R = system
     predicted = stabilising_dare(weighted, H, Q, R)
     K = gain(predicted, H, R)
     left = jnp.eye(F.shape[0], dtype=F.dtype) - K @ H

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -63,6 +64,13 @@ def steady_state_continuous(
     noise = G @ Q @ G.T
     weighted = F + jnp.asarray(fading_rate, F.dtype) * jnp.eye(F.shape[0], dtype=F.dtype)
     require_steady_state(weighted, H, noise, on_edge=np.real)
+    return _steady_state(F, weighted, H, noise, R)
+
+
+@jax.jit
+def _steady_state(
+    F: Array, weighted: Array, H: Array, noise: Array, R: Array
+) -> ContinuousSteadyState:
     cov = stabilising_care(weighted, H, noise, R)
     K = jnp.linalg.solve(R, H @ cov).T
     closed_loop = F - K @ H
@@ -71,16 +79,16 @@ def steady_state_continuous(
 
 
 def weighting_as_input_noise(noise: Array, cov: Array, fading_rate: Array) -> Array:
-    r"""The input noise (..., n, n) with which a filter *without* weighting has the same gains.
+    r"""The input noise (n, n) with which a filter *without* weighting has the same gains.
 
     .. math:: G Q G' + 2 \alpha \Pi_\alpha \quad (4\text{-}7)
 
     Args:
-        noise: G Q G' (..., n, n).
-        cov: Pi (..., n, n) at the same time.
-        fading_rate: alpha in 1/s, () or (...).
+        noise: G Q G' (n, n).
+        cov: Pi (n, n) at the same time.
+        fading_rate: alpha in 1/s, ().
 
     Deviations: the first terms of (4-7) are printed as Pi F + F' Pi for Pi F' + F Pi, and the text
         after it says measurement noise for input noise.
     """
-    return noise + 2 * jnp.asarray(fading_rate)[..., None, None] * jnp.asarray(cov)
+    return noise + 2 * fading_rate * cov

@@ -1,5 +1,6 @@
 """The actual error of a Kalman-Bucy filter while it settles."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
-from ewif_jax.continuous.kalman_bucy import matrices, solve
+from ewif_jax.continuous.kalman_bucy import matrices, solve, split
 from ewif_jax.kernels import symmetric
 
 
@@ -30,7 +31,7 @@ def actual_error_continuous(
     truth: ContinuousSystem | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    max_steps: int = 16_384,
+    max_steps: int = 65_536,
 ) -> ErrorCurve:
     r"""The actual mean square error of the weighted filter.
 
@@ -54,8 +55,23 @@ def actual_error_continuous(
     checks.psd("cov0", cov0)
     checks.shape("times", times, ("K",))
     cov0 = jnp.asarray(cov0)
-    used = matrices(system, params, fading_rate, cov0.dtype)
-    real = matrices(system if truth is None else truth, params, 0.0, cov0.dtype)
+    used = split((*system, fading_rate), cov0.dtype)
+    real = split((*(system if truth is None else truth), 0.0), cov0.dtype)
+    return _error_curve(
+        (used[0], real[0]),
+        (used[1], real[1]),
+        params,
+        cov0,
+        jnp.asarray(times, cov0.dtype),
+        (rtol, atol, max_steps),
+    )
+
+
+@partial(jax.jit, static_argnames=("functions", "tolerances"))
+def _error_curve(
+    functions: tuple, constants: tuple, params: Any, cov0: Array, times: Array, tolerances: tuple
+) -> ErrorCurve:
+    used, real = (matrices(f, c, params) for f, c in zip(functions, constants, strict=True))
 
     def field(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         error, cov = (symmetric.unpack(x) for x in state)
@@ -66,6 +82,5 @@ def actual_error_continuous(
         return symmetric.pack(slope), symmetric.pack(now.slope(cov))
 
     start = symmetric.pack(cov0), symmetric.pack(cov0)
-    times = jnp.asarray(times, cov0.dtype)
-    error, design = solve(field, start, times, rtol, atol, max_steps)
+    error, design = solve(field, start, times, *tolerances)
     return ErrorCurve(times, jax.vmap(symmetric.unpack)(error), jax.vmap(symmetric.unpack)(design))

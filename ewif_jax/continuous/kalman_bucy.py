@@ -1,6 +1,7 @@
 """The Kalman-Bucy filter, with or without exponential data weighting."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -39,7 +40,7 @@ def kalman_bucy(
     fading_rate: Any = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
-    max_steps: int = 16_384,
+    max_steps: int = 65_536,
 ) -> Filtered:
     r"""Estimates at the given times from a measured signal.
 
@@ -61,7 +62,7 @@ def kalman_bucy(
         times: (K,) increasing seconds within the signal; the first is the start.
         fading_rate: alpha >= 0 in 1/s, a constant or a function (params, t).
         rtol, atol: tolerances of the solver; default by dtype (1e-9 and 1e-11 in float64).
-        max_steps: of the solver; exceeding it is an error.
+        max_steps: of the solver, which steps to every sample; exceeding it is an error.
 
     Raises:
         ValueError: shapes, times that do not increase or leave the signal, fading_rate < 0.
@@ -76,19 +77,35 @@ def kalman_bucy(
     if not callable(fading_rate):
         checks.at_least("fading_rate", fading_rate, 0.0)
     dtype = jnp.asarray(signal.value).dtype
-    at = matrices(system, params, fading_rate, dtype)
-    stamps, values = jnp.asarray(signal.time, dtype), jnp.asarray(signal.value)
+    samples = Signal(jnp.asarray(signal.time, dtype), jnp.asarray(signal.value))
+    functions, constants = split((*system, fading_rate), dtype)
+    tolerances = (rtol, atol, max_steps)
+    prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
+    times = jnp.asarray(times, dtype)
+    return _kalman_bucy(functions, constants, params, samples, prior, times, tolerances)
+
+
+@partial(jax.jit, static_argnames=("functions", "tolerances"))
+def _kalman_bucy(
+    functions: tuple,
+    constants: tuple,
+    params: Any,
+    signal: Signal,
+    prior: Gaussian,
+    times: Array,
+    tolerances: tuple,
+) -> Filtered:
+    at = matrices(functions, constants, params)
 
     def field(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         mean, cov = state[0], symmetric.unpack(state[1])
         now = at(t)
         K = now.gain(cov)
-        z = jax.vmap(lambda v: jnp.interp(t, stamps, v), in_axes=1)(values)
+        z = jax.vmap(lambda v: jnp.interp(t, signal.time, v), in_axes=1)(signal.value)
         return now.F @ mean + K @ (z - now.H @ mean), symmetric.pack(now.slope(cov))
 
-    start = jnp.asarray(prior.mean, dtype), symmetric.pack(jnp.asarray(prior.cov, dtype))
-    times = jnp.asarray(times, dtype)
-    mean, packed = solve(field, start, times, rtol, atol, max_steps)
+    start = prior.mean, symmetric.pack(prior.cov)
+    mean, packed = solve(field, start, times, *tolerances, kinks=signal.time)
     cov = jax.vmap(symmetric.unpack)(packed)
     gains = jax.vmap(lambda t, P: at(t).gain(P))(times, cov)
     return Filtered(times, mean, cov, gains)
@@ -114,17 +131,21 @@ class Instant(NamedTuple):
         return moved + moved.T + 2 * self.fading_rate * cov - K @ self.R @ K.T + self.noise
 
 
-def matrices(
-    system: ContinuousSystem, params: Any, fading_rate: Any, dtype: Any
-) -> Callable[[Array], Instant]:
-    """The system's matrices as a function of time."""
+def split(values: tuple, dtype: Any) -> tuple[tuple, tuple]:
+    """The functions among `values` (None elsewhere), and the constants (None elsewhere)."""
+    functions = tuple(x if callable(x) else None for x in values)
+    return functions, tuple(None if callable(x) else jnp.asarray(x, dtype) for x in values)
+
+
+def matrices(functions: tuple, constants: tuple, params: Any) -> Callable[[Array], Instant]:
+    """F, G, H, Q, R and the fading rate, split, as a function of time."""
 
     def at(t: Array) -> Instant:
-        def read(x: Any) -> Array:
-            return jnp.asarray(x(params, t) if callable(x) else x, dtype)
-
-        F, G, H, Q, R = (read(x) for x in system)
-        return Instant(F, H, G @ Q @ G.T, R, read(fading_rate))
+        F, G, H, Q, R, rate = (
+            jnp.asarray(f(params, t), t.dtype) if c is None else c
+            for f, c in zip(functions, constants, strict=True)
+        )
+        return Instant(F, H, G @ Q @ G.T, R, rate)
 
     return at
 
@@ -136,9 +157,10 @@ def solve(
     rtol: float | None,
     atol: float | None,
     max_steps: int,
+    kinks: Array | None = None,
 ) -> Any:
     """The solution of d state / dt = field(t, state) at `times`, stacked, from `start` at the
-    first of them."""
+    first of them. The solver steps exactly to `times` and to `kinks` of the field."""
     try:
         import diffrax
     except ImportError as missing:
@@ -149,15 +171,17 @@ def solve(
     tolerances = diffrax.PIDController(
         rtol=rtol or (1e-9 if double else 1e-5), atol=atol or (1e-11 if double else 1e-7)
     )
+    stops = times if kinks is None else jnp.concatenate([times, kinks])
+    stepping = diffrax.ClipStepSizeController(tolerances, step_ts=jnp.sort(stops))
     return diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: field(t, y)),
+        diffrax.ODETerm(lambda t, y, args: field(jnp.asarray(t), y)),
         diffrax.Tsit5(),
         times[0],
         times[-1],
         None,
         start,
         saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=tolerances,
+        stepsize_controller=stepping,
         max_steps=max_steps,
     ).ys
 

@@ -21,6 +21,7 @@ from jax.interpreters import ad, batching, mlir
 
 Function = Callable[..., Any]
 _ADJOINTS: dict[Function, Function] = {}
+_CHEAP: set[Function] = set()
 
 
 def kernel(fn: Function) -> Function:
@@ -38,9 +39,12 @@ def kernel(fn: Function) -> Function:
     return call
 
 
-def linear_kernel(fn: Function, adjoint: Function) -> Function:
-    """The kernel of a linear function of one array whose adjoint is known."""
+def linear_kernel(fn: Function, adjoint: Function, cheap: bool = False) -> Function:
+    """The kernel of a linear function of one array whose adjoint is known; `cheap`: computing it
+    again costs less than keeping it."""
     _ADJOINTS[fn], _ADJOINTS[adjoint] = adjoint, fn
+    if cheap:
+        _CHEAP.add(fn)
     return kernel(fn)
 
 
@@ -83,7 +87,7 @@ def _inline(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
 
 
 def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
-    if batch == 0:
+    if batch == 0 or fn in _CHEAP:
         return _flat(fn)(*args)
     with set_xla_metadata(inlineable="false"):
         return _jitted(fn)(*args)

@@ -5,7 +5,7 @@ by zero and gradients stay finite where a matrix is singular.
 """
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +54,11 @@ def solve(f: Factor, b: Array) -> Array:
     return _solve(f.lower, f.reciprocal, b)
 
 
+def solved(a: Array, b: Array) -> Array:
+    """A^-1 b for b (n,) or (n, k), where the factor itself is not needed."""
+    return _solved(negligible(a.shape[0], a.dtype))(a, b)
+
+
 def inverse(f: Factor) -> Array:
     """A^-1 (n, n), symmetric by construction."""
     root = forward(f, jnp.eye(f.lower.shape[0], dtype=f.lower.dtype))
@@ -67,64 +72,65 @@ def half_log_det(f: Factor) -> Array:
 
 @cache
 def _factor(tolerance: float):
-    @kernel
-    def factored(a: Array) -> tuple[Array, Array]:
-        n, batch = a.shape[0], a.ndim - 2
-        columns, reciprocals = [], []
-        rest = a
-        for j in range(n):
-            kept = rest[j, j] > tolerance * a[j, j]
-            reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, rest[j, j], 1)), 0)
-            below = np.arange(n).reshape(n, *(1,) * batch) >= j
-            column = jnp.where(below, rest[:, j] * reciprocal[None], 0)
-            columns.append(column)
-            reciprocals.append(reciprocal)
-            if j + 1 < n:
-                rest = _then(_downdate, rest, column, column)
-        return jnp.stack(columns, 1), jnp.stack(reciprocals)
-
-    return factored
+    return kernel(lambda a: _factored(a, tolerance))
 
 
-def _forward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
-    x = []
-    for j in range(b.shape[0]):
-        x.append(_scaled(b, reciprocal, j))
-        if j + 1 < b.shape[0]:
-            b = _then(_downdate, b, lower[:, j], x[-1])
-    return jnp.stack(x)
+@cache
+def _solved(tolerance: float):
+    return kernel(lambda a, b: jnp.stack(_solve_rows(*_factored(a, tolerance), b)))
 
 
-def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
-    x = []
-    for j in reversed(range(b.shape[0])):
-        x.append(_scaled(b, reciprocal, j))
-        if j > 0:
-            b = _then(_downdate, b, lower[j, :], x[-1])
-    return jnp.stack(x[::-1])
+def _factored(a: Array, tolerance: float) -> tuple[Array, Array]:
+    n = a.shape[0]
+    columns, reciprocals = [], []
+    for j in range(n):
+        rest = _less(n, a[:, j], [c[j] for c in columns], columns)
+        kept = rest[j] > tolerance * a[j, j]
+        reciprocals.append(jnp.where(kept, lax.rsqrt(jnp.where(kept, rest[j], 1)), 0))
+        below = np.arange(n).reshape(n, *(1,) * (a.ndim - 2)) >= j
+        columns.append(jnp.where(below, rest * reciprocals[j][None], 0))
+    return jnp.stack(columns, 1), jnp.stack(reciprocals)
 
 
-def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
+def _forward_rows(lower: Array, reciprocal: Array, b: Array | list[Array]) -> list[Array]:
+    x: list[Array] = []
+    for j in range(len(b)):
+        x.append(_times(_less(len(b), b[j], lower[j, :j], x), reciprocal[j]))
+    return x
+
+
+def _backward_rows(lower: Array, reciprocal: Array, b: Array | list[Array]) -> list[Array]:
+    x: list[Array] = []
+    for j in reversed(range(len(b))):
+        x.insert(0, _times(_less(len(b), b[j], lower[j + 1 :, j], x), reciprocal[j]))
+    return x
+
+
+def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> list[Array]:
     return _backward_rows(lower, reciprocal, _forward_rows(lower, reciprocal, b))
 
 
-_forward, _backward, _solve = map(kernel, (_forward_rows, _backward_rows, _solve_rows))
+_forward, _backward, _solve = (
+    kernel(lambda *args, rows=rows: jnp.stack(rows(*args)))
+    for rows in (_forward_rows, _backward_rows, _solve_rows)
+)
 
 
-def _scaled(b: Array, reciprocal: Array, j: int) -> Array:
-    """b[j] times reciprocal[j]; b may have one axis more."""
-    factor = reciprocal[j]
-    return b[j] * (factor if b[j].ndim == factor.ndim else factor[None])
+def _less(n: int, b: Array, numbers: Any, arrays: list[Array]) -> Array:
+    """b minus the sum of numbers times arrays; kept apart where recomputing steps would add up."""
+    if n <= 3 or not arrays:
+        return _minus_products(b, *numbers, *arrays)
+    batch = numbers[0].ndim  # a number and its batch axes
+    return stage(_minus_products, b, *numbers, *arrays, batch=batch)
 
 
-def _downdate(b: Array, column: Array, row: Array) -> Array:
-    """b - column row', or b - column times the number `row`."""
-    outer = column * row[None] if column.ndim == b.ndim else column[:, None] * row[None]
-    return b - outer
+def _minus_products(b: Array, *factors: Array) -> Array:
+    count = len(factors) // 2
+    for number, array in zip(factors[:count], factors[count:], strict=True):
+        b = b - _times(array, number)
+    return b
 
 
-def _then(fn, b: Array, column: Array, row: Array) -> Array:
-    """The next step of an elimination, kept apart where recomputing earlier ones would add up."""
-    if b.shape[0] <= 3:
-        return fn(b, column, row)
-    return stage(fn, b, column, row, batch=column.ndim - 1)
+def _times(x: Array, number: Array) -> Array:
+    """x times a number; x may have one axis more."""
+    return x * (number if x.ndim == number.ndim else number[None])

@@ -62,7 +62,7 @@ def update(
     full = symmetric.unpack(packed)
     cross = matmul(H, full)
     innovation = innovate(difference, cross, matmul(cross, H.T) + R, mask)
-    weights = cholesky.solve(innovation.factor, innovation.cross)
+    weights = cholesky.solved(innovation.cov, innovation.cross)
     mean = _moved(mean, weights, innovation.value)
     half = _reduced(full, innovation.cross, weights)
     packed = _joseph(half, matmul(H, half), mask_cov(R, mask), weights)

@@ -53,7 +53,7 @@ def _gather(full: Array) -> Array:
     return flat[rows * n + cols] + twice * flat[cols * n + rows]
 
 
-_pack = linear_kernel(_pick, _fill)
+_pack = linear_kernel(_pick, _fill, cheap=True)
 _unpack = linear_kernel(_spread, _gather)
 
 

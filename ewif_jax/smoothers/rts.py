@@ -105,7 +105,7 @@ def _rts(
         return (mean, cov), later
 
     first = (t0, prior.mean, symmetric.pack(prior.cov))
-    (_, *last), steps = lax.scan(ahead, first, in_time)
-    _, (mean, cov) = lax.scan(back, tuple(last), steps, reverse=True)
+    (_, last, last_cov), steps = lax.scan(ahead, first, in_time)
+    _, (mean, cov) = lax.scan(back, (last, last_cov), steps, reverse=True)
     place = jnp.argsort(order)
     return Gaussian(mean[place], jax.vmap(symmetric.unpack)(cov)[place])

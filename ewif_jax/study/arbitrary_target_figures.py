@@ -75,7 +75,7 @@ def _frame(ax: Axes, example: Mapping[str, Any], names: Sequence[str], moment: f
         ax.plot(*some.T, marker, color="#888888", markersize=5, fillstyle="none")
     for name, (color, style, width) in zip(names, LOOK, strict=True):
         ax.plot(*example[name][tail].T, style, color=color, linewidth=width, label=name)
-    ax.set_xlim(here[0] - 60, here[0] + 60)
-    ax.set_ylim(here[1] - 45, here[1] + 45)
+    ax.set_xlim(here[0] - 32, here[0] + 32)
+    ax.set_ylim(here[1] - 24, here[1] + 24)
     ax.legend(loc="upper left", fontsize=7, frameon=False)
     label(ax, "east [m]", "north [m]", f"{moment:.1f} s: + in sequence, o late, by arrival")

@@ -10,7 +10,6 @@ import pandas as pd
 import xarray as xr
 from jax import Array
 
-from ewif_jax.analysis.equivalence import Case, equivalent_tau
 from ewif_jax.analysis.expected import expected_mse
 from ewif_jax.analysis.merit import random_walk_gain
 from ewif_jax.estimator import run as run_filter
@@ -26,17 +25,20 @@ from ewif_jax.tuning import rmse_loss, tune
 from ewif_jax.types import Estimator
 
 DT, VARIANCE = 0.1, 0.5
+PUBLISHED_TAU, PUBLISHED_NOISE = 0.5, 0.1
+BLOCK = 16
 SETTINGS = ("published", "tuned on samples", "exact optimum")
 
 
 class Filter(NamedTuple):
-    """One of the two filters: its parameter, the published value and RMSE, where the gradient
-    starts from, and the range of the curve."""
+    """One of the two filters: its parameter, its exact RMSE (see `exact_rmse`), the published value
+    and RMSE, where the gradient starts from, and the range of the curve."""
 
     name: str
     estimator: Estimator
     parameter: str
     unit: str
+    exact: Callable[[Array], Array]
     published: float
     printed: float
     starts: tuple[float, float]
@@ -46,38 +48,49 @@ class Filter(NamedTuple):
 def filters() -> tuple[Filter, Filter]:
     """The EWIF, and the Kalman filter that the first sample starts."""
     model = sine_model(VARIANCE)
-    exponential = ewif(model, tau=lambda p: p["tau"])
-    kalman = information(model)
+
+    def described(name: str, estimator: Estimator, parameter: str, *rest: Any) -> Filter:
+        unit = {"tau": "s", "sigma_w": "m"}[parameter]
+        return Filter(name, estimator, parameter, unit, exact_rmse(estimator, parameter), *rest)
+
+    exponential, noisy = ewif(model, tau=lambda p: p["tau"]), information(model)
     return (
-        Filter("EWIF", exponential, "tau", "s", 0.5, 0.31, (0.05, 5.0), (0.05, 5.0)),
-        Filter("KF", kalman, "sigma_w", "m", 0.1, 0.33, (0.01, 1.0), (0.02, 1.0)),
+        described("EWIF", exponential, "tau", PUBLISHED_TAU, 0.31, (0.05, 5.0), (0.05, 5.0)),
+        described("KF", noisy, "sigma_w", PUBLISHED_NOISE, 0.33, (0.01, 1.0), (0.02, 1.0)),
     )
 
 
-def case() -> Case:
-    """The noise-free sine, for exact expected errors."""
-    time, truth = sine_signal(dt=DT)
-    return Case(stream(time, truth), truth, VARIANCE, 0.0)
-
-
-def exact_rmse(one: Filter) -> Callable[[Array], Array]:
-    """Parameter value -> root of the exact expected mean square error over time."""
-    at = case()
+def exact_rmse(estimator: Estimator, parameter: str) -> Callable[[Array], Array]:
+    """Parameter values (k,) -> root of the exact expected mean square error over time (k,)."""
 
     def rmse(value: Array) -> Array:
-        params, noise = {one.parameter: value}, at.noise_cov
+        time, truth = sine_signal(dt=DT)
         mse = expected_mse(
-            one.estimator, params, at.measurements, at.truth, noise_cov=noise, prior=None, t0=at.t0
+            estimator,
+            {parameter: value},
+            stream(time, truth),
+            truth,
+            noise_cov=VARIANCE,
+            prior=None,
+            t0=0.0,
         )
         return jnp.sqrt(jnp.mean(mse))
 
-    return rmse
+    return jax.jit(jax.vmap(rmse))
+
+
+def in_blocks(exact: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
+    """`exact` of any number of points, `BLOCK` at a time: one compiled program does for all."""
+    blocks = np.resize(points, (-(-len(points) // BLOCK), BLOCK))
+    found = [np.asarray(exact(jnp.asarray(block))) for block in blocks]
+    return np.concatenate(found)[: len(points)]
 
 
 def run(experiment: Experiment) -> None:
     """Tunes both filters, measures them on fresh runs, and compares with the exact error."""
     found, series, rows, notes = {}, {}, [], []
-    for one in filters():
+    pair = filters()
+    for one in pair:
         tuned = experiment.piece(f"{one.name}-tuned", lambda f=one: _tuned(experiment, f))
         measured = experiment.piece(
             f"{one.name}-measured", lambda f=one, t=tuned: _measured(experiment, f, t)
@@ -89,8 +102,8 @@ def run(experiment: Experiment) -> None:
             f"{one.name}: the gradient of the exact error leads from {start} to {end:.4f}"
             for start, end in zip(one.starts, tuned["optimum"], strict=True)
         ]
-    example = _example(experiment)
-    notes += _equivalent(experiment)
+    example = _example(experiment, pair)
+    notes += _equivalent(experiment, pair[0], float(found["KF"][1]["exact"][0]))
     experiment.arrays("sine", xr.Dataset({**series, **example}))
     experiment.figure("tracks", sine_figures.tracks(example))
     experiment.figure("rmse", sine_figures.curves(found))
@@ -104,7 +117,7 @@ def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
     """Gradient descent on a training batch, and on the exact error from both starts at once: the
     loss is their mean and the optimizer treats each number by itself, so neither sees the other."""
     quick = experiment.options.quick
-    steps, name = (100 if quick else 200), one.parameter
+    steps, name = 200, one.parameter
     keys = jax.random.split(experiment.key(1), 64 if quick else 256)
     label = f"{one.name}: tuning on {len(keys)} sampled runs"
     with experiment.timed(label), experiment.progress(label) as report:
@@ -114,9 +127,12 @@ def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
         sampled = tune(loss, {name: np.asarray(one.starts[1])}, steps=steps, progress=report)
     label = f"{one.name}: tuning on the exact error"
     with experiment.timed(label), experiment.progress(label) as report:
-        each = jax.vmap(exact_rmse(one))
-        mean = jax.jit(lambda params: jnp.mean(each(params[name])))
-        exact = tune(mean, {name: jnp.asarray(one.starts)}, steps=steps, progress=report)
+        exact = tune(
+            lambda params: jnp.mean(one.exact(params[name])),
+            {name: jnp.asarray(one.starts)},
+            steps=steps,
+            progress=report,
+        )
     return {
         "sampled": sampled.params[name],
         "sampled_path": sampled.history["params"][name],
@@ -149,7 +165,7 @@ def _measured(experiment: Experiment, one: Filter, tuned: Arrays) -> dict[str, A
     fine = np.geomspace(*one.span, 60)
     with experiment.timed(f"{one.name}: exact expected error"):
         points = np.concatenate([value, fine, tuned["path"].ravel()])
-        exact = np.asarray(jax.lax.map(exact_rmse(one), jnp.asarray(points), batch_size=16))
+        exact = in_blocks(one.exact, points)
     at_value, at_fine, at_path = np.split(exact, [len(value), len(value) + len(fine)])
     roots = np.asarray([s.root("squared_error") for s in statistics])
     single = np.sqrt(np.stack([s.per_run["squared_error"] for s in statistics[:3]]))
@@ -182,13 +198,13 @@ def _rows(one: Filter, found: Arrays) -> list[dict[str, Any]]:
     ]
 
 
-def _example(experiment: Experiment) -> dict[str, xr.DataArray]:
+def _example(experiment: Experiment, pair: tuple[Filter, Filter]) -> dict[str, xr.DataArray]:
     """One realisation, filtered with the published settings."""
     with experiment.timed("one realisation"):
         seen, truth, _ = sine(dt=DT, r=VARIANCE).simulate(experiment.key(3))
         time = {"time": ("time", np.asarray(seen.time), {"units": "s"})}
         series = {"truth": truth, "measured": seen.value}
-        for one in filters():
+        for one in pair:
             params = {one.parameter: one.published}
             series[one.name] = run_filter(one.estimator, params, seen, prior=None, t0=0.0).mean
     return {
@@ -197,16 +213,21 @@ def _example(experiment: Experiment) -> dict[str, xr.DataArray]:
     }
 
 
-def _equivalent(experiment: Experiment) -> list[str]:
-    """The tau that behaves like the published process noise, by two criteria."""
-    params = {"sigma_w": filters()[1].published}
+def _equivalent(experiment: Experiment, exponential: Filter, rmse: float) -> list[str]:
+    """The tau that behaves like the published process noise: by equal steady gain, and by equal
+    expected RMSE (the root nearby, on the rising side of the curve)."""
+    params = {"sigma_w": PUBLISHED_NOISE}
 
     def compute() -> dict[str, Any]:
+        gain = float(random_walk_gain(params["sigma_w"] / np.sqrt(VARIANCE)))
+        by_gain = -DT / np.log1p(-gain)
+        low, high = by_gain / 1.5, by_gain * 1.5
         with experiment.timed("equivalent tau"):
-            gain = random_walk_gain(params["sigma_w"] / np.sqrt(VARIANCE))
-            by_gain = -DT / jnp.log1p(-gain)
-            by_error = equivalent_tau(sine_model(VARIANCE), params, dt=DT, case=case(), steps=200)
-            return {"tau": np.asarray([by_gain, by_error])}
+            for _ in range(6):
+                grid = np.linspace(low, high, BLOCK)
+                above = int(np.argmax(in_blocks(exponential.exact, grid) > rmse))
+                low, high = grid[max(above - 1, 0)], grid[above]
+        return {"tau": np.asarray([by_gain, (low + high) / 2])}
 
     taus = experiment.piece("equivalent", compute)["tau"]
     criteria = ("equal steady gain", "equal expected RMSE")
@@ -223,7 +244,8 @@ def _labelled(one: Filter, found: Arrays) -> dict[str, xr.DataArray]:
     name, rmse = one.name, {"units": "m", "long_name": f"{one.name} RMSE"}
     given = {"units": one.unit, "long_name": one.parameter}
     value, fine = f"{name}_{one.parameter}", f"{name}_{one.parameter}_curve"
-    descent = {"descent": [f"exact from {start}" for start in one.starts]}
+    descent = f"{name}_descent"
+    starts = {descent: [f"from {start}" for start in one.starts]}
 
     def along(dim: str, at: str, x: str) -> xr.DataArray:
         return xr.DataArray(found[x], dims=dim, coords={dim: (dim, found[at], given)}, attrs=rmse)
@@ -241,9 +263,9 @@ def _labelled(one: Filter, found: Arrays) -> dict[str, xr.DataArray]:
         ),
         f"{name}_sampled_loss": xr.DataArray(found["sampled_loss"], dims="step", attrs=rmse),
         f"{name}_descent_{one.parameter}": xr.DataArray(
-            found["path"], dims=("step", "descent"), coords=descent, attrs=given
+            found["path"], dims=("step", descent), coords=starts, attrs=given
         ),
         f"{name}_descent_rmse": xr.DataArray(
-            found["path_exact"], dims=("step", "descent"), coords=descent, attrs=rmse
+            found["path_exact"], dims=("step", descent), coords=starts, attrs=rmse
         ),
     }

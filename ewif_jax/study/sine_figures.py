@@ -54,7 +54,7 @@ def curves(found: dict[str, Any]) -> Figure:
         below.axhline(0, color=color)
         below.errorbar(value, of["rmse"] - of["exact"], error, **points)
         label(above, "", "RMSE [m]" if above is axes[0, 0] else "", name)
-        side = "Monte Carlo − exact [m]" if below is axes[1, 0] else ""  # noqa: RUF001
+        side = "less exact [m]" if below is axes[1, 0] else ""
         label(below, f"{SYMBOL[name]} [{one.unit}]", side)
     return figure
 

@@ -186,8 +186,10 @@ def _landscape(drawn: list[tuple[Method, Any]]) -> Figure:
     shown = np.isfinite(CUTOFFS)
     for ax, (one, found) in zip(axes, drawn, strict=True):
         mean = np.sqrt(found["squared"][2:].mean(1)).reshape(one.grid.size, CUTOFFS.size)
-        filled = ax.contourf(CUTOFFS[shown], one.grid, mean[:, shown], 16, cmap="viridis")
-        figure.colorbar(filled, ax=ax, label="RMSE [m]")
+        span = mean[:, shown].max() - mean.min()
+        levels = mean.min() + span * np.linspace(0, 1, 17) ** 3
+        filled = ax.contourf(CUTOFFS[shown], one.grid, mean[:, shown], levels, cmap="viridis")
+        figure.colorbar(filled, ax=ax, label="RMSE [m]", spacing="uniform", format="%.1f")
         ax.plot(*found["descent"][::-1], "-", color="white", linewidth=1.5, label="descent")
         ax.plot(*found["descent"][::-1, -1], "*", color="red", markersize=13, label="learned")
         if np.isfinite(found["cutoff"][0]):

@@ -21,7 +21,7 @@ def tau(params):
 
 
 def test_kalman_fixed_lag_is_the_posterior_of_the_data_so_far():
-    world = case(6, 3, 2)
+    world = case(6, 2, 1)
     trace = run(fixed_lag(model(), LAG), world.params, world.stream(), prior=world.prior, t0=0.0)
     filtered = run(kalman(model()), world.params, world.stream(), prior=world.prior, t0=0.0)
     close(trace.info.log_likelihood, filtered.info.log_likelihood)
@@ -37,7 +37,7 @@ def test_kalman_fixed_lag_is_the_posterior_of_the_data_so_far():
 
 
 def test_kalman_fixed_lag_refuses_late_data():
-    world = case(6, 3)
+    world = case(6, 2)
     order = np.arange(STEPS)[::-1]
     smoother = fixed_lag(model(), LAG)
     trace = run(smoother, world.params, world.stream(order), prior=world.prior, t0=0.0)
@@ -48,7 +48,7 @@ def test_kalman_fixed_lag_refuses_late_data():
 
 @pytest.mark.parametrize("lag", [0.0, 0.7])
 def test_ewif_fixed_lag_is_batch_least_squares_at_the_lagged_time(lag):
-    world = case(6, 3)
+    world = case(6, 2)
     order = np.random.default_rng(7).permutation(STEPS)
     smoother = fixed_lag_ewif(model(), tau, lag=lag)
     trace = run(smoother, world.params, world.stream(order), prior=None, t0=0.0)
@@ -63,7 +63,7 @@ def test_ewif_fixed_lag_is_batch_least_squares_at_the_lagged_time(lag):
 
 
 def test_ewif_fixed_lag_is_reporting_earlier():
-    world = case(6, 3)
+    world = case(6, 2)
     arguments = {"prior": world.prior, "t0": 0.0}
     smoother = fixed_lag_ewif(model(), tau, lag=0.5)
     lagged = run(smoother, world.params, world.stream(), **arguments)
@@ -75,7 +75,7 @@ def test_ewif_fixed_lag_is_reporting_earlier():
 
 
 def test_gradients_are_finite_differences():
-    world = case(6, 3, 1)
+    world = case(6, 2, 1)
     smoother = fixed_lag(model(), LAG)
 
     def loss(scale):

@@ -9,7 +9,7 @@ import ewif_jax as ej
 from ewif_jax.parallel import run_parallel
 from laws.cases import case, close, model
 
-METHODS = [("blocked", None, True), ("blocked", 3, False), ("associative", None, False)]
+METHODS = [("blocked", None), ("blocked", 3), ("associative", None)]
 
 
 def tau(params):
@@ -29,15 +29,14 @@ def same_trace(actual, expected, rtol):
     close(actual.final_state.matrix, expected.final_state.matrix, rtol)
 
 
-@pytest.mark.parametrize(("method", "block", "with_prior"), METHODS)
-def test_late_masked_irregular_data(method, block, with_prior):
+@pytest.mark.parametrize(("method", "block"), METHODS)
+def test_late_masked_irregular_data(method, block):
     """With an input, and reported at other times than the filter's."""
-    world = case(8, 3)
+    world = case(8, 2)
     order = np.array([1, 0, 2, 4, 3, 6, 5, 9, 7, 8])
-    stream = world.stream(order)
-    prior = world.prior if with_prior else None
     times = np.maximum.accumulate(world.times[order]) + 0.1
-    arguments = {"prior": prior, "t0": 0.0, "times": times if with_prior else None}
+    arguments = {"prior": world.prior, "t0": 0.0, "times": times}
+    stream = world.stream(order)
     sequential = ej.run(ej.ewif(model(), tau), world.params, stream, **arguments)
     parallel = run_parallel(
         model(), world.params, stream, tau=tau, method=method, block=block, **arguments
@@ -57,7 +56,7 @@ def test_steps_of_constant_matrices():
 
 
 def test_any_weight_of_the_family():
-    world = case(8, 3)
+    world = case(8, 2)
 
     def slowing(params, measured, at):
         return ((1.0 + measured) / (1.0 + at)) ** 2
@@ -68,8 +67,7 @@ def test_any_weight_of_the_family():
     same_trace(parallel, sequential, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("method", "mode"), [("blocked", jax.grad), ("associative", jax.jacfwd)])
-def test_derivatives(method, mode):
+def test_gradient():
     world = case(8, 2)
     arguments = {"prior": None, "t0": 0.0}
 
@@ -82,15 +80,14 @@ def test_derivatives(method, mode):
 
     def parallel(decay):
         params = {**world.params, "tau": decay}
-        trace = run_parallel(model(), params, world.stream(), tau=tau, method=method, **arguments)
-        return loss(trace)
+        return loss(run_parallel(model(), params, world.stream(), tau=tau, **arguments))
 
-    expected = jax.jacfwd(sequential)(0.9)
-    np.testing.assert_allclose(mode(parallel)(0.9), expected, rtol=1e-8)
+    slope = (sequential(0.9 + 1e-5) - sequential(0.9 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(parallel)(0.9), slope, rtol=1e-7)
 
 
 def test_float32_is_close_far_from_zero():
-    far = ej.models.constant_acceleration(sensors=ej.models.position_sensor(1.0))
+    far = ej.models.constant_velocity(sensors=ej.models.position_sensor(1.0))
     time = 0.1 * np.arange(1, 301)
     value = 1e4 + 10.0 * np.sin(time) + np.random.default_rng(9).normal(size=300)
     high = ej.run(ej.ewif(far, 2.0), None, ej.stream(time, value), prior=None, t0=0.0)
@@ -102,7 +99,7 @@ def test_float32_is_close_far_from_zero():
 
 
 def test_bad_input_is_named():
-    world = case(8, 3)
+    world = case(8, 2)
     for changes, word in (({"method": "both"}, "method"), ({"block": 0}, "block"), ({}, "tau")):
         with pytest.raises(ValueError, match=word):
             run_parallel(

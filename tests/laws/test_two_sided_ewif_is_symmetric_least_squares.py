@@ -23,7 +23,7 @@ def both_sides(params, measured, at):
 
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_equals_dense_least_squares(with_prior):
-    world = case(2, 3)
+    world = case(2, 2)
     prior = {"prior": world.prior, "t0": 1.7} if with_prior else {}
     known = (world.prior.mean, world.prior.cov, 1.7) if with_prior else None
     weight = wls.symmetric_weight(world.params["tau"])
@@ -39,7 +39,7 @@ def test_equals_dense_least_squares(with_prior):
 
 
 def test_derivative_equals_that_of_batch_wls():
-    world = case(2, 3)
+    world = case(2, 2)
     data = world.stream()
 
     def passes(decay):
@@ -50,12 +50,11 @@ def test_derivative_equals_that_of_batch_wls():
         params = {**world.params, "tau": decay}
         return batch_wls(model(), params, data, REPORTS, weight=both_sides).mean
 
-    for derivative in (jax.jacfwd, jax.jacrev):
-        close(derivative(passes)(0.9), jax.jacfwd(dense)(0.9), rtol=1e-8)
+    close(jax.jacrev(passes)(0.9), jax.jacfwd(dense)(0.9), rtol=1e-8)
 
 
 def test_padding_changes_nothing():
-    world = case(2, 3)
+    world = case(2, 2)
     plain = two_sided_ewif(model(), world.params, world.stream(), tau=tau, times=REPORTS)
     padding = jax.tree.map(lambda x: x[:3], world.stream())
     padding = padding._replace(mask=padding.mask & False, time=jnp.array([-3.0, 2.1, 9.0]))
@@ -66,13 +65,13 @@ def test_padding_changes_nothing():
 
 
 def test_unknown_state_is_nan():
-    world = case(2, 3)
+    world = case(2, 2)
     one = jax.tree.map(lambda x: x[:1], world.stream())
     assert np.all(np.isnan(two_sided_ewif(model(), world.params, one, tau=tau).mean))
 
 
 def test_float32_is_close():
-    world = case(2, 3)
+    world = case(2, 2)
     single = world.stream()._replace(value=world.stream().value.astype(jnp.float32))
     low = two_sided_ewif(model(), world.params, single, tau=tau, times=REPORTS)
     high = two_sided_ewif(model(), world.params, world.stream(), tau=tau, times=REPORTS)
@@ -81,7 +80,7 @@ def test_float32_is_close():
 
 
 def test_bad_input_is_named():
-    world = case(2, 3)
+    world = case(2, 2)
     with pytest.raises(ValueError, match="tau"):
         two_sided_ewif(model(), world.params, world.stream(), tau=0.0)
     with pytest.raises(ValueError, match="t0"):

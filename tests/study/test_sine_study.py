@@ -47,7 +47,7 @@ def test_the_papers_single_runs_are_ordinary(results):
 def test_gradient_finds_the_optimum_from_both_sides(results, name, parameter, best):
     with xr.open_dataset(results / "sine.nc", engine="h5netcdf") as arrays:
         path = arrays[f"{name}_descent_{parameter}"].values
-        start = [one.starts for one in sine.filters() if one.name == name][0]
+        start = next(one.starts for one in sine.filters() if one.name == name)
         assert path[0] == pytest.approx(start)
         assert path[-1] == pytest.approx(best, rel=0.01)
         assert arrays[f"{name}_descent_rmse"].values[-1] == pytest.approx(0.2996, abs=1e-4)

