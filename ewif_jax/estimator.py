@@ -148,8 +148,8 @@ _tried: set[Any] = set()
 def _fingerprint(structure: Any, values: Any) -> Any:
     """Equal for equal trials; None while something in `values` is not known."""
     leaves, tree = jax.tree.flatten(values)
-    known = [checks.known(x) for x in leaves]
-    if any(x is None for x in known):
+    known = [x for x in map(checks.known, leaves) if x is not None]
+    if len(known) < len(leaves):
         return None
     return structure, tree, tuple((x.shape, x.dtype.str, x.tobytes()) for x in known)
 
@@ -213,7 +213,7 @@ def _in_dtype(x: Any, dtype: Any) -> Any:
     return jnp.asarray(x, dtype) if value is None else value.astype(dtype)
 
 
-def verdict(late: Array, present: Array, late_status: Status = Status.TOO_LATE) -> Array:
+def verdict(late: Array, present: Array, late_status: Status | Array = Status.TOO_LATE) -> Array:
     """The status of an update that has nothing more to say than "late" and "present"."""
     status = jnp.where(late, late_status, Status.USED)
     return jnp.where(present, status, Status.MASKED).astype(jnp.int32)

@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.batch import Frozen, broadcast_prefix, dependent
 from ewif_jax.estimator import Clock
+from ewif_jax.layout import Frozen, broadcast_prefix, dependent
 from ewif_jax.scores import Score, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -153,9 +153,7 @@ def dependent_on_key(simulate: Callable[[Array], Simulation], key: Array) -> Sim
 
 
 @partial(jax.jit, static_argnames=("simulate", "flags"))
-def _simulate(
-    simulate: Callable[[Array], Simulation], keys: Array, flags: Frozen
-) -> Simulation:
+def _simulate(simulate: Callable[[Array], Simulation], keys: Array, flags: Frozen) -> Simulation:
     axes = jax.tree.map(lambda f: 0 if f else None, flags.tree)
     return jax.vmap(simulate, out_axes=axes)(keys)
 

@@ -14,16 +14,9 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.consistency import nees, nis
-from ewif_jax.batch import (
-    Step,
-    Frozen,
-    broadcast_prefix,
-    device_count,
-    over_devices,
-    runs_last,
-    scan_batch,
-)
-from ewif_jax.estimator import Clock, cast, float_dtype, validated
+from ewif_jax.batch import Step, check_runs, flagged, scan_batch
+from ewif_jax.estimator import Clock, cast, float_dtype
+from ewif_jax.layout import Frozen, device_count, over_devices, runs_last
 from ewif_jax.types import Estimator, Gaussian, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]
@@ -44,7 +37,7 @@ def normalised_error(step: Step, truth: Array, mask: Array) -> Array:
 
 
 def normalised_innovation(step: Step, truth: Array, mask: Array) -> Array:
-    """NIS per measured component: 1 on average if the filter is consistent; NaN if none was used."""
+    """NIS per measured component: 1 on average if consistent; NaN if none was used."""
     del truth
     count = jnp.maximum(jnp.sum(mask).astype(step.mean.dtype), 1)
     return jnp.where(_used(step), nis(step.info) / count, jnp.nan)
@@ -103,16 +96,8 @@ def scored(
     checks.shape("truth", truth, (*lead, "k"))
     same = truth.shape[-2] == steps and (truth.ndim == 2 or truth.shape[0] == runs)
     checks.require(same, "truth", f"{runs} runs and {steps} arrivals", f"shape {truth.shape}")
-    time_f, sensor_f = jnp.ndim(measurements.time) == 2, jnp.ndim(measurements.sensor) == 2
-    flags = (
-        broadcast_prefix(params_per_run, params),
-        Measurement(time_f, True, sensor_f, jnp.ndim(measurements.mask) == 3),
-        None if prior is None else Gaussian(jnp.ndim(prior.mean) == 2, jnp.ndim(prior.cov) == 3),
-        None if times is None else jnp.ndim(times) == 2,
-    )
-    inputs = (params, measurements, prior, times)
-    first = jax.tree.map(lambda x, f: x[0] if f else x, inputs, flags)
-    validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
+    inputs, flags = flagged(params, params_per_run, measurements, prior, times)
+    check_runs(estimator, inputs, flags, t0, clock, key)
     keys = None if key is None else key if jnp.ndim(key) == 1 else jax.random.split(key, runs)
     return _scored(
         estimator,

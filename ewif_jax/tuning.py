@@ -10,9 +10,8 @@ import optax
 from jax import Array
 
 from ewif_jax import checks, scores
-from ewif_jax.estimator import Clock
 from ewif_jax.scores import Score, average, scored
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Measurement
 
 Loss = Callable[..., Array]
 
@@ -189,9 +188,7 @@ def _loss(
     setting: Mapping[str, Any],
 ) -> Loss:
     def loss(params: Any) -> Array:
-        values = scored(
-            estimator, params, measurements, truth, scores={"score": score}, **setting
-        )
+        values = scored(estimator, params, measurements, truth, scores={"score": score}, **setting)
         return finish(average(values["score"]))
 
     return loss

@@ -1,4 +1,4 @@
-"""The types every part of the package speaks: all are pytrees, their field names are the contract."""
+"""The types every part of the package speaks: all are pytrees, and their field names are fixed."""
 
 from collections.abc import Callable
 from enum import IntEnum

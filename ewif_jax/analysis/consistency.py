@@ -61,7 +61,8 @@ def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float
     checks.require(0 < level < 1, "level", "a probability between 0 and 1", level)
     shape = dof * samples / 2
     tail = (1 - level) / 2
-    return tuple(2 * _gamma_quantile(shape, p) / samples for p in (tail, 1 - tail))
+    low, high = (2 * _gamma_quantile(shape, p) / samples for p in (tail, 1 - tail))
+    return low, high
 
 
 def _quadratic(error: Array, cov: Array) -> Array:

@@ -35,9 +35,7 @@ def settled_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: in
 
     def last(value: Array) -> Array:
         values = jnp.zeros((steps, m), dtype).at[-1].set(value)
-        stream = Measurement(
-            time, values, jnp.zeros(steps, jnp.int32), jnp.ones((steps, m), bool)
-        )
+        stream = Measurement(time, values, jnp.zeros(steps, jnp.int32), jnp.ones((steps, m), bool))
         return run(estimator, params, stream, prior=None, t0=jnp.zeros((), dtype)).mean[-1]
 
     return jax.jacfwd(last)(jnp.zeros(m, dtype))
@@ -157,9 +155,7 @@ def _minimise(fn: Callable[[Array], Array], low: float, high: float) -> float:
     return float(np.exp((a + b) / 2))
 
 
-def _nearest_root(
-    fn: Callable[[Array], Array], low: float, high: float, near: float
-) -> float:
+def _nearest_root(fn: Callable[[Array], Array], low: float, high: float, near: float) -> float:
     """The root in [low, high] nearest to `near` on a log scale; NaN if there is none."""
     evaluate = jax.jit(jax.vmap(fn))
     grid = np.linspace(np.log(low), np.log(high), 129)

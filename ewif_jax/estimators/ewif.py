@@ -14,9 +14,7 @@ from ewif_jax.models.model import Model, need_linear, resolve
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
-def ewif(
-    model: Model, tau: Any = None, *, weight: Callable[..., Array] | None = None
-) -> Estimator:
+def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None = None) -> Estimator:
     r"""The least-squares estimate in which a measurement of age s counts exp(-s / tau).
 
     .. math::
@@ -65,9 +63,7 @@ def ewif(
         decay = checks.positive("tau", resolve(tau, params))
         return jnp.exp((measured - at) / decay)
 
-    def init(
-        params: Any, prior: Gaussian | None, t0: Any, key: Any = None
-    ) -> InformationState:
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> InformationState:
         del key
         if tau is not None:
             checks.positive("tau", resolve(tau, params))

@@ -33,9 +33,7 @@ def information(model: Model) -> Estimator:
     """
     need_linear(model, "information")
 
-    def init(
-        params: Any, prior: Gaussian | None, t0: Any, key: Any = None
-    ) -> InformationState:
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> InformationState:
         del key
         return form.start(model, params, prior, t0)
 

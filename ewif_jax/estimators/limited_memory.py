@@ -104,9 +104,7 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
             measurement.time < state.buffer.time[oldest]
         )
         used = present & ~out
-        buffer = jax.tree.map(
-            lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement
-        )
+        buffer = jax.tree.map(lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement)
         before = fit(params, state, state.time)
         _, info = form.absorb(model, params, before, measurement, 1.0)
         late = jnp.where(out, Status.TOO_LATE, Status.LATE_USED)

@@ -56,9 +56,7 @@ def square_root(model: Model) -> Estimator:
         known = time >= state.time
         return RootState(time, jnp.where(known, mean, jnp.nan), jnp.where(known, root, jnp.nan))
 
-    def update(
-        params: Any, state: RootState, measurement: Measurement
-    ) -> tuple[RootState, Info]:
+    def update(params: Any, state: RootState, measurement: Measurement) -> tuple[RootState, Info]:
         mask = measurement.mask
         late = measurement.time < state.time
         present = jnp.any(mask)

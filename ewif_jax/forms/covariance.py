@@ -51,7 +51,9 @@ def covariance_form(
             cov = cov * _saturated(inflation(params, state.time, ahead), cov)
         cov = cov + symmetric.pack(Q)
         known = time >= state.time
-        return CovarianceState(time, jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan))
+        return CovarianceState(
+            time, jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan)
+        )
 
     def update(
         params: Any, state: CovarianceState, measurement: Measurement

@@ -13,7 +13,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.batched import kernel
+from ewif_jax.kernels.batched import kernel, total
 from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model
 from ewif_jax.models.model import affine_flow, observation, size
@@ -79,9 +79,7 @@ def absorb(
     seen, difference, R = _sight(model, params, state, measurement)
     matrix, vector = _gained(seen, difference, R, measurement.mask)
     updated = recentred(
-        state._replace(
-            matrix=state.matrix + weight * matrix, vector=state.vector + weight * vector
-        )
+        state._replace(matrix=state.matrix + weight * matrix, vector=state.vector + weight * vector)
     )
     return updated, _info(state, seen, difference, R, measurement, weight)
 
@@ -148,7 +146,9 @@ def _squares(white: Array) -> tuple[Array, Array]:
     """Packed rows' rows, and rows' target, of white = (rows, target)."""
     rows, target = white[:, :-1], white[:, -1]
     i, j = np.triu_indices(rows.shape[1])
-    return sum(r[i] * r[j] for r in rows), sum(r * t[None] for r, t in zip(rows, target, strict=True))
+    return total(r[i] * r[j] for r in rows), total(
+        r * t[None] for r, t in zip(rows, target, strict=True)
+    )
 
 
 def _info(

@@ -8,13 +8,15 @@ batched kernel stays a function of its own in the compiled program, across which
 recomputed. Derivatives, of any order and in both modes, come from the function itself.
 """
 
-from collections.abc import Callable, Sequence
-from functools import cache, wraps
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, reduce, wraps
+from operator import add
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -48,6 +50,11 @@ def linear_kernel(fn: Function, adjoint: Function, cheap: bool = False) -> Funct
     return kernel(fn)
 
 
+def total(terms: Iterable[Array]) -> Array:
+    """The sum of at least one array."""
+    return reduce(add, terms)
+
+
 def stage(fn: Function, *args: Array, batch: int) -> Any:
     """`fn` of arrays with `batch` trailing axes, for use inside a kernel: what other parts of the
     kernel read is computed once."""
@@ -75,7 +82,7 @@ def _jitted(fn: Function) -> Function:
 @cache
 def _outputs(fn: Function, avals: tuple[tuple[tuple[int, ...], Any], ...]) -> Sequence[Any]:
     shapes = jax.eval_shape(_flat(fn), *(jax.ShapeDtypeStruct(*aval) for aval in avals))
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in shapes]
+    return [ShapedArray(x.shape, x.dtype) for x in shapes]
 
 
 def _abstract(*avals: Any, fn: Function, batch: int) -> Sequence[Any]:
@@ -144,9 +151,7 @@ def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) 
     inner = tuple((x.shape[: x.ndim - batch], x.dtype) for x in unknown)
     ranks = tuple(x.ndim - batch for x in (*known, *given))
     out = _kernel_p.bind(*known, *given, fn=_adjoint(fn, linear, inner, ranks), batch=batch)
-    results = iter(
-        _summed(x, aval.shape) for x, aval in zip(out, unknown, strict=True)
-    )
+    results = iter(_summed(x, aval.shape) for x, aval in zip(out, unknown, strict=True))
     return [next(results) if undefined else None for undefined in linear]
 
 

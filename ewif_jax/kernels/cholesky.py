@@ -15,7 +15,7 @@ from ewif_jax.kernels.batched import kernel, stage
 
 
 class Factor(NamedTuple):
-    """lower (n, n) with A = lower lower', the reciprocals of its diagonal (n,), full rank or not."""
+    """lower (n, n) with A = lower lower', the reciprocals of its diagonal (n,), and the rank."""
 
     lower: Array
     reciprocal: Array

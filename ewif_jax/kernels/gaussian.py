@@ -7,12 +7,12 @@ import numpy as np
 from jax import Array
 
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.batched import kernel
+from ewif_jax.kernels.batched import kernel, total
 from ewif_jax.kernels.small import matmul
 
 
 class Innovation(NamedTuple):
-    """What a measurement is compared with: value (m,), cov (m, m), its factor, cross (m, n) = H P."""
+    """What a measurement is compared with: value (m,), cov (m, m), its factor, and H P (m, n)."""
 
     value: Array
     cov: Array
@@ -93,4 +93,4 @@ def _joseph(half: Array, seen: Array, R: Array, weights: Array) -> Array:
 
 def _contract(a: Array, b: Array) -> Array:
     """The sum of a b over their first axis."""
-    return sum(a[k] * b[k] for k in range(a.shape[0]))
+    return total(a[k] * b[k] for k in range(a.shape[0]))

@@ -9,10 +9,11 @@ Both are exact rewritings; only the layout differs from `jnp.matmul`.
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ewif_jax.kernels.batched import stage
+from ewif_jax.kernels.batched import stage, total
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -41,7 +42,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _abstract(a, b):
-    return jax.core.ShapedArray((a.shape[0], b.shape[1]), jnp.promote_types(a.dtype, b.dtype))
+    return ShapedArray((a.shape[0], b.shape[1]), jnp.promote_types(a.dtype, b.dtype))
 
 
 def _batch(args, dims):
@@ -61,7 +62,7 @@ def _batch(args, dims):
 
 
 def _sum_of_products(a: Array, b: Array) -> Array:
-    return sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
+    return total(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
 
 
 _matmul_p = Primitive("small_matmul")

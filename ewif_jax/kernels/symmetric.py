@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ewif_jax.kernels.batched import kernel, linear_kernel, stage
+from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
 
 
 def order(packed: Array) -> int:
@@ -140,7 +140,7 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
 @kernel
 def _times(packed: Array, x: Array) -> Array:
     full = _spread(packed)
-    return sum(full[:, k] * x[None, k] for k in range(x.shape[0]))
+    return total(full[:, k] * x[None, k] for k in range(x.shape[0]))
 
 
 @kernel
@@ -149,7 +149,7 @@ def _congruence(a: Array, packed: Array) -> Array:
     rows, cols = np.triu_indices(n)
     if a.size > n * n:
         half = stage(_left, a, packed, batch=batch)
-        return sum(half[rows, k] * a[cols, k] for k in range(n))
+        return total(half[rows, k] * a[cols, k] for k in range(n))
     flat = a.reshape(n * n)
 
     def minor(i: np.ndarray, j: np.ndarray) -> Array:
@@ -163,4 +163,4 @@ def _congruence(a: Array, packed: Array) -> Array:
 
 def _left(a: Array, packed: Array) -> Array:
     full = _spread(packed)
-    return sum(a[:, k, None] * full[None, k] for k in range(a.shape[0]))
+    return total(a[:, k, None] * full[None, k] for k in range(a.shape[0]))

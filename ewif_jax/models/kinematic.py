@@ -13,7 +13,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.small import matvec
-from ewif_jax.models.model import Linear, Model, affine_flow, resolve
+from ewif_jax.models.model import Linear, Model, affine_motion, resolve
 from ewif_jax.models.sensors import Sensor, bank
 
 
@@ -87,17 +87,8 @@ def _kinematic(
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
         return resolve(q, params) * _polynomial(Q_terms, t1 - t0)
 
-    if matrix is not None:
-        linear = Linear(F, b, matrix(n))
-    else:
-        linear = None
-    motion = Model(lambda *_: None, process_cov, observe, cov, residual, Linear(F, b, observe))
-
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
-        matrix, offset = affine_flow(motion, params, t0, t1, x.dtype)
-        moved = matvec(matrix, x)
-        return moved if offset is None else moved + offset
-
+    linear = None if matrix is None else Linear(F, b, matrix(n))
+    transition = affine_motion(F, b)
     return Model(transition, process_cov, observe, cov, residual, linear, count)
 
 

@@ -77,24 +77,16 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
         ValueError: a constant has the wrong shape, or a constant Q or R is not PSD; tables H and R
             speak of different numbers of sensors.
     """
-    n = None
-    if not callable(F):
-        F, n = _one_step(F)
+    F, n = _one_step(F)
     if not callable(Q) and Q is not None:
         checks.psd("Q", Q)
         checks.shape("Q", Q, ("n" if n is None else n,) * 2)
         Q = _over_one_interval(jnp.asarray(Q))
-    if not callable(b) and b is not None:
-        checks.shape("b", b, ("n" if n is None else n,))
-        b = _over_one_interval(jnp.asarray(b))
+    if b is not None:
+        b = _input(b, n)
     H, rows = _by_sensor("H", H)
     R, cols = _by_sensor("R", R)
     sensors = _count_sensors(rows, cols)
-
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
-        matrix, offset = _affine(F, b, params, t0, t1, x.dtype)
-        moved = matvec(matrix, x)
-        return moved if offset is None else moved + offset
 
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
         if Q is None:
@@ -108,9 +100,19 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
     def measurement_cov(params: Any, sensor: Array, t: Array) -> Array:
         return jnp.asarray(R(params, sensor, t))
 
-    return Model(
-        transition, process_cov, observe, measurement_cov, subtract, Linear(F, b, H), sensors
-    )
+    transition, linear = affine_motion(F, b), Linear(F, b, H)
+    return Model(transition, process_cov, observe, measurement_cov, subtract, linear, sensors)
+
+
+def affine_motion(F: Any, b: Any) -> Callable[..., Array]:
+    """The transition (params, x, t0, t1) -> (n,) of x(t1) = F x(t0) + b, in either direction."""
+
+    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
+        matrix, offset = _affine(F, b, params, t0, t1, x.dtype)
+        moved = matvec(matrix, x)
+        return moved if offset is None else moved + offset
+
+    return transition
 
 
 def affine_flow(
@@ -124,9 +126,7 @@ def affine_flow(
     return _affine(linear.F, linear.b, params, t0, t1, dtype)
 
 
-def flow(
-    model: Model, params: Any, x: Array, t0: Array, t1: Array
-) -> tuple[Array, Array, Array]:
+def flow(model: Model, params: Any, x: Array, t0: Array, t1: Array) -> tuple[Array, Array, Array]:
     """x at t1 (n,), the Jacobian F (n, n) of the motion at x, and Q (n, n) for t1 >= t0."""
     Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
     if model.linear is not None:
@@ -196,7 +196,7 @@ def need_linear(model: Model, method: str) -> Linear:
 
 
 def _affine(
-    F: Callable[..., Array], b: Callable[..., Array] | None, params: Any, t0, t1, dtype: Any
+    F: Any, b: Any, params: Any, t0: Array, t1: Array, dtype: Any
 ) -> tuple[Array, Array | None]:
     matrix = jnp.asarray(F(params, t0, t1), dtype)
     if b is None:
@@ -205,14 +205,24 @@ def _affine(
     return matrix, jnp.where(t1 >= t0, ahead, -matvec(matrix, ahead))
 
 
-def _one_step(F: Any) -> tuple[Callable[..., Array], int]:
+def _input(b: Any, n: int | None) -> Any:
+    if callable(b):
+        return b
+    checks.shape("b", b, ("n" if n is None else n,))
+    return _over_one_interval(jnp.asarray(b))
+
+
+def _one_step(F: Any) -> tuple[Any, int | None]:
+    """F as a function of (params, t0, t1), and its size if it is constant."""
+    if callable(F):
+        return F, None
     checks.shape("F", F, ("n", "n"))
     checks.require(np.shape(F)[0] == np.shape(F)[1], "F", "a square matrix", np.shape(F))
     checks.finite("F", F)
     ahead = jnp.asarray(F)
     n = ahead.shape[0]
-    known = checks.known(F)
-    invertible = known is not None and np.linalg.matrix_rank(known) == n
+    known = np.asarray(F)
+    invertible = np.linalg.matrix_rank(known) == n
     back = jnp.asarray(np.linalg.inv(known) if invertible else np.full((n, n), np.nan), ahead.dtype)
 
     def matrix(params: Any, t0: Array, t1: Array) -> Array:
@@ -223,11 +233,11 @@ def _one_step(F: Any) -> tuple[Callable[..., Array], int]:
     return matrix, n
 
 
-def _over_one_interval(value: Array) -> Callable[..., Array]:
+def _over_one_interval(value: Array) -> Any:
     return lambda params, t0, t1: jnp.where(t0 == t1, 0, value)
 
 
-def _by_sensor(argument: str, x: Any) -> tuple[Callable[..., Array], int | None]:
+def _by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
     """A function of (params, sensor, t), and how many sensors it knows of: S of a table, 0 for a
     matrix that all sensors share, None for a function."""
     if callable(x):

@@ -1,4 +1,4 @@
-"""What sensors see. Every kinematic state begins with the position, so a sensor fits any of them."""
+"""What sensors see. Every kinematic state begins with the position, so a sensor fits any."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

@@ -59,7 +59,10 @@ def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
     ):
         good = counted & (outcome.after[key] > 0)
         points = outcome.after[key][good]
-        axes.semilogy(time[good], points, ".", markersize=3, alpha=0.5, color=MEASURED)
+        size = 3 if points.size > 1000 else 6
+        axes.semilogy(
+            time[good], points, ".", markersize=size, color=MEASURED, label="one measurement"
+        )
         axes.set_ylim(bottom=np.quantile(points, 0.01) / 2 if points.size else None)
         for text, run, color, style in runs:
             good = counted & np.isfinite(run[key])

@@ -1,0 +1,121 @@
+"""Runs as the last axis: mapping over it, following what depends on it, splitting it up."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.extend.core import Literal
+from jax.sharding import Mesh, PartitionSpec
+
+from ewif_jax import checks
+
+
+def vmap_last(
+    fn: Callable[..., Any], in_flags: tuple, force: Any = None, trace_only: bool = False
+) -> Callable[..., tuple[Any, Any]]:
+    """`fn` mapped over the last axis of the flagged inputs; returns (outputs, their flags).
+
+    Outputs that cannot depend on a flagged input come back without the run axis, unless `force`
+    (a pytree of bools for the first output, None for the rest) asks for it.
+    """
+
+    def mapped(*args: Any) -> tuple[Any, Any]:
+        single = jax.tree.map(
+            lambda x, f: jax.eval_shape(lambda x: x[..., 0], x) if f else x, args, in_flags
+        )
+        closed, shape = jax.make_jaxpr(fn, return_shape=True)(*single)
+        flat = jax.tree.leaves(in_flags)
+        tree = jax.tree.structure(shape)
+        out = dependent(closed.jaxpr, flat)
+        if force is not None:
+            wanted = jax.tree.leaves(force[0])
+            out = [a or b for a, b in zip(out, wanted + out[len(wanted) :], strict=True)]
+        out_flags = jax.tree.unflatten(tree, out)
+        if trace_only or not any(flat):
+            return (None if trace_only else fn(*args)), out_flags
+        axes = jax.tree.map(lambda f: -1 if f else None, in_flags)
+        out_axes = jax.tree.map(lambda f: -1 if f else None, out_flags)
+        return jax.vmap(fn, in_axes=axes, out_axes=out_axes)(*args), out_flags
+
+    return mapped
+
+
+def dependent(jaxpr: Any, flags: list[bool]) -> list[bool]:
+    """Which outputs of a jaxpr can depend on the flagged inputs (never too few)."""
+    tainted = {v for v, f in zip(jaxpr.invars, flags, strict=True) if f}
+    for eqn in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in tainted for v in eqn.invars):
+            tainted.update(eqn.outvars)
+    return [not isinstance(v, Literal) and v in tainted for v in jaxpr.outvars]
+
+
+def runs_last(tree: Any, flags: Any) -> Any:
+    """The flagged leaves with their leading axis moved to the end."""
+    return jax.tree.map(lambda x, f: jnp.moveaxis(jnp.asarray(x), 0, -1) if f else x, tree, flags)
+
+
+def runs_first(tree: Any, flags: Any, runs: int) -> Any:
+    """Every leaf with the run axis in front, repeated where it was shared."""
+    return jax.tree.map(
+        lambda x, f: jnp.moveaxis(x, -1, 0) if f else jnp.broadcast_to(x, (runs, *x.shape)),
+        tree,
+        flags,
+    )
+
+
+def over_devices(
+    fn: Callable[..., Any], flags: tuple, out_flags: Any, devices: int
+) -> Callable[..., Any]:
+    """`fn` with the runs (last axis of the flagged leaves) split over the local devices."""
+    if devices == 1:
+        return fn
+    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
+
+    def call(*args: Any) -> Any:
+        specs = jax.tree.map(lambda x, f: _spec(jnp.ndim(x) - 1, f), args, flags)
+        out = jax.eval_shape(fn, *args)
+        out_specs = jax.tree.map(lambda x, f: _spec(len(x.shape) - 1, f), out, out_flags)
+        return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=out_specs, check_vma=False)(
+            *args
+        )
+
+    return call
+
+
+def device_count(runs: int, devices: int | None) -> int:
+    """How many local devices to use: the largest number up to `devices` that divides `runs`."""
+    limit = len(jax.local_devices()) if devices is None else checks.whole("devices", devices, 1)
+    limit = min(limit, len(jax.local_devices()))
+    return max(d for d in range(1, limit + 1) if runs % d == 0)
+
+
+def broadcast_prefix(prefix: Any, tree: Any) -> Any:
+    """A pytree of bools like `tree` from a prefix of it."""
+    return jax.tree.map(lambda f, sub: jax.tree.map(lambda _: bool(f), sub), prefix, tree)
+
+
+class Frozen:
+    """A pytree of bools as a hashable static argument."""
+
+    def __init__(self, tree: Any):
+        self.tree = tree
+        leaves, structure = jax.tree.flatten(tree)
+        self._id = (tuple(leaves), structure)
+
+    def __hash__(self) -> int:
+        return hash(self._id)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Frozen) and self._id == other._id
+
+
+def spread(x: Array, runs: int) -> Array:
+    """`x` repeated along a new last axis."""
+    return jnp.broadcast_to(x[..., None], (*x.shape, runs))
+
+
+def _spec(last: int, flag: bool) -> PartitionSpec:
+    return PartitionSpec(*([None] * last), "runs") if flag else PartitionSpec()
