@@ -79,7 +79,7 @@ def run(
         prior: Gaussian at t0, or None for "unknown" where the estimator accepts it.
         t0: time of the prior in seconds.
         times: (T,) when to report after arrival k; default the running maximum of the measurement
-            times. Reporting propagates a copy and never moves the filter.
+            times that were present (a masked row is predicted to its own time). Reporting propagates a copy and never moves the filter.
         clock: "validity": the filter's time is the newest measurement's. "arrival": the filter
             itself moves to times[k] before update k, so any older measurement is late.
         key: PRNG key, for estimators that draw noise.

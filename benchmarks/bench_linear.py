@@ -1,4 +1,4 @@
-"""Time other packages on L1: ``python -m benchmarks.bench_peers [--quick]``.
+"""Time `kalman` and other packages on L1: ``python -m benchmarks.bench_linear [--quick]``.
 
 (a) all runs share the process noise, (b) each run has its own. All peers must agree on the
 means. The Numba kernel is compiled once for all its rows: only the first shows the compilation.
@@ -12,11 +12,12 @@ from pathlib import Path
 
 import jax
 
+from benchmarks import ours
 from benchmarks.peers import NOTES, PEERS, SPLIT_PEERS, TIMED_RUNS, check
 from benchmarks.timing import measure, report
 from benchmarks.workloads import constant_acceleration
 
-OUTPUT = Path(__file__).parent / "results" / "peers.json"
+OUTPUT = Path(__file__).parent / "results" / "linear.json"
 
 
 def main() -> None:
@@ -34,8 +35,9 @@ def main() -> None:
 
 def _filters(names: list[str], devices: int) -> dict:
     """Select the peers named; those that can, again with their runs split over `devices`."""
-    filters = {name: PEERS[name] for name in names}
+    filters = {"ewif_jax": ours.kalman_filter} | {name: PEERS[name] for name in names}
     if devices > 1:
+        filters[f"ewif_jax, {devices} devices"] = partial(ours.kalman_filter, devices=devices)
         filters |= {
             f"{name}, {devices} devices": partial(SPLIT_PEERS[name], devices=devices)
             for name in names

@@ -1,0 +1,58 @@
+"""Time the value and gradient of an RMSE over L1 (G1): ``python -m benchmarks.bench_gradient``.
+
+Every row is compiled as one program. `x forward` is its time over that of the loss alone.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+import ewif_jax as ej
+from benchmarks import ours
+from benchmarks.timing import measure, report
+from benchmarks.workloads import constant_acceleration
+
+OUTPUT = Path(__file__).parent / "results" / "gradient.json"
+
+
+def main() -> None:
+    """Time forward pass, reverse mode and forward mode for (q, r) and for tau."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=1024)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--repeat", type=int, default=7)
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    options = parser.parse_args()
+    workload = constant_acceleration(options.runs, options.steps)
+    sensor = ej.models.position_sensor(lambda p: p["r"], dims=2)
+    model = ej.models.constant_acceleration(sensors=sensor, q=lambda p: p["q"], dims=2)
+    prior = ej.Gaussian(workload.prior_mean, workload.prior_cov)
+    cases = {
+        "kalman": (ej.kalman(model), {"q": jnp.float32(0.01), "r": jnp.float32(1.0)}, "q"),
+        "ewif": (ej.ewif(model, lambda p: p["tau"]), {"tau": jnp.float32(1.0)}, "tau"),
+    }
+    results = []
+    for name, (estimator, params, single) in cases.items():
+        params = {"r": jnp.float32(1.0)} | params
+        loss = ej.rmse_loss(
+            estimator, ours.stream(workload), workload.truth[..., :2], prior=prior, t0=0.0
+        )
+        rows = {
+            "forward": loss,
+            "reverse mode, all": jax.value_and_grad(loss),
+            "forward mode, one": lambda p, loss=loss, single=single: jax.jvp(
+                lambda x: loss(p | {single: x}), (p[single],), (jnp.ones_like(p[single]),)
+            ),
+        }
+        for label, fn in rows.items():
+            compiled = jax.jit(fn)
+            times = measure(lambda f=compiled, p=params: f(p), options.repeat)
+            row = {"workload": f"G1 {name}", "name": label, "note": ""}
+            results.append(row | {"run_steps": options.runs * options.steps} | times)
+    report(results, options.output, references=("forward",))
+
+
+if __name__ == "__main__":
+    main()
