@@ -78,8 +78,9 @@ def run(
         measurements: T arrivals in their order of arrival, stacked on axis 0.
         prior: Gaussian at t0, or None for "unknown" where the estimator accepts it.
         t0: time of the prior in seconds.
-        times: (T,) when to report after arrival k; default the running maximum of the measurement
-            times that were present (a masked row is predicted to its own time). Reporting propagates a copy and never moves the filter.
+        times: (T,) when to report after arrival k; default the running maximum of the times
+            of what was measured (a masked row is predicted to its own). Reporting propagates a
+            copy and never moves the filter.
         clock: "validity": the filter's time is the newest measurement's. "arrival": the filter
             itself moves to times[k] before update k, so any older measurement is late.
         key: PRNG key, for estimators that draw noise.

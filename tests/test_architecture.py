@@ -15,7 +15,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 RANKS = (
     {"types"},
     {"checks", "kernels"},
-    {"models"},
+    {"models", "layout"},
     {"estimator"},
     {"forms", "batch"},
     {"estimators"},
