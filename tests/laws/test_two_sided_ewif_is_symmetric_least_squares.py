@@ -67,6 +67,7 @@ def test_padding_changes_nothing():
 def test_unknown_state_is_nan():
     world = case(2, 2)
     one = jax.tree.map(lambda x: x[:1], world.stream())
+    one = one._replace(mask=np.array([[True, False]]))  # one number for two states
     assert np.all(np.isnan(two_sided_ewif(model(), world.params, one, tau=tau).mean))
 
 
