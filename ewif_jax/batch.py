@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import Clock, advance, float_dtype, initial, validated
@@ -21,8 +21,10 @@ from ewif_jax.layout import (
     broadcast_prefix,
     device_count,
     over_devices,
+    runs_adjacent,
     runs_first,
     runs_last,
+    scan_in_blocks,
     spread,
     vmap_last,
 )
@@ -39,6 +41,7 @@ class Step(NamedTuple):
 
 
 Observer = Callable[[Step, Any], Any]
+"""(Step, context of this run and arrival) -> what to keep of them."""
 
 
 def run_batch(
@@ -53,6 +56,8 @@ def run_batch(
     key: Any = None,
     params_per_run: Any = False,
     observe: Observer | None = None,
+    context: Any = None,
+    context_per_run: Any = False,
     devices: int | None = None,
 ) -> Any:
     """The same numbers as `vmap(run)`, many times faster on a CPU.
@@ -66,10 +71,12 @@ def run_batch(
         t0: time of the prior in seconds.
         times: (T,) or (R, T) report times as in `run`.
         clock: as in `run`.
-        key: PRNG key, split over the runs.
+        key: PRNG key, split over the runs; or (R,) typed keys, one for each.
         params_per_run: True, False, or a pytree prefix of `params` of these.
-        observe: function (Step of one arrival, None) -> pytree to return instead of everything;
-            what it does not use is not computed.
+        observe: function (Step of one arrival, its context) -> pytree to return instead of
+            everything; what it does not use is not computed.
+        context: pytree of what else `observe` sees of each arrival, leaves (T, ...), or
+            (R, T, ...) where marked in `context_per_run` (a prefix, like `params_per_run`).
         devices: how many local devices share the runs (default all; R must be a multiple).
 
     Returns:
@@ -81,13 +88,17 @@ def run_batch(
     runs = value.shape[0]
     inputs, input_flags = flagged(params, params_per_run, measurements, prior, times)
     check_runs(estimator, inputs, input_flags, t0, clock, key)
-    keys = None if key is None else jax.random.split(key, runs)
+    flags = (
+        *input_flags,
+        None if key is None else True,
+        broadcast_prefix(context_per_run, context),
+    )
+    keys = None if key is None else key if jnp.ndim(key) == 1 else jax.random.split(key, runs)
     return _run_batch(
         estimator,
-        inputs,
+        (*inputs, keys, context),
         t0,
-        keys,
-        Frozen(input_flags),
+        Frozen(flags),
         clock,
         observe,
         device_count(runs, devices),
@@ -117,32 +128,59 @@ def check_runs(
     estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, key: Any
 ) -> None:
     """Refuses what `run` refuses, with the first run for all and the largest sensor of any run."""
-    first = jax.tree.map(lambda x, f: x[0] if f else x, inputs, flags)
+    first = jax.tree.map(_first_run, inputs, flags)
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
         first = (first[0], first[1]._replace(sensor=sensors.max(0)), *first[2:])
     validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
 
 
-def scan_batch(
-    estimator: Estimator,
-    inputs: tuple[Any, Measurement, Gaussian | None, Any],
-    flags: Any,
-    t0: Any,
-    keys: Any,
-    clock: Clock,
-    observe: Observer,
-    context: Any = None,
-    context_flags: Any = None,
-) -> tuple[Any, Any]:
-    """Observations stacked over T, with runs as the LAST axis where `observe` depends on the run.
+def _first_run(x: Any, flag: bool) -> Any:
+    if not flag:
+        return x
+    known = checks.known(x)
+    return x[0] if known is None else known[0]
 
-    `inputs` (params, measurements, prior, times) have runs last where `flags` says so; `context`
-    is passed to `observe` arrival by arrival (leaves (T, ..., R) or (T, ...)). Returns the
-    observations and the final states, and fills nothing in: a leaf without a run axis is shared.
-    """
-    params, measurements, prior, times = inputs
-    params_f, measurements_f, prior_f, times_f = flags
+
+@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices"))
+def _run_batch(
+    estimator: Estimator,
+    inputs: Any,
+    t0: Any,
+    flags: Frozen,
+    clock: Clock,
+    observe: Observer | None,
+    devices: int,
+) -> Any:
+    params, measurements, prior, times, keys, context = inputs
+    dtype = float_dtype(measurements.value)
+    measurements = measurements._replace(
+        time=jnp.asarray(measurements.time, dtype), value=jnp.asarray(measurements.value, dtype)
+    )
+    times = None if times is None else jnp.asarray(times, dtype)
+    inputs = runs_last((params, measurements, prior, times, keys, context), flags.tree)
+
+    def filtered(*inputs: Any) -> Any:
+        return _scanned(estimator, inputs, flags.tree, t0, clock, observe or _everything)
+
+    seen, state = over_devices(filtered, flags.tree, devices)(*inputs)
+    if observe is not None:
+        return seen
+    time, mean, cov, info = seen
+    return Trace(time, mean, cov, info, state)
+
+
+def _everything(step: Step, context: Any) -> Step:
+    del context
+    return step
+
+
+def _scanned(
+    estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, observe: Observer
+) -> tuple[Any, Any]:
+    """Observations (R, T, ...) and final states (R, ...) from inputs with the runs last."""
+    params, measurements, prior, times, keys, context = inputs
+    params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
     dtype = measurements.value.dtype
     runs = measurements.value.shape[-1]
 
@@ -159,13 +197,11 @@ def scan_batch(
         mean, cov = estimator.estimate(params, shown)
         return moved.kept, observe(Step(shown.time, mean, cov, moved.info), seen)
 
-    key_f = None if keys is None else True
-    state, state_f = vmap_last(start, (params_f, prior_f, key_f))(params, prior, keys)
-    arrivals = (measurements, times, context)
-    arrival_f = (measurements_f, times_f, context_flags)
+    state, state_f = vmap_last(start, (params_f, prior_f, keys_f))(params, prior, keys)
+    arrivals, arrival_f = (measurements, times, context), (measurements_f, times_f, context_f)
     one = jax.tree.map(lambda x: x[0], arrivals)
     while True:
-        _, (next_f, _) = vmap_last(body, (params_f, state_f, arrival_f), trace_only=True)(
+        _, (next_f, seen_f) = vmap_last(body, (params_f, state_f, arrival_f), trace_only=True)(
             params, state, one
         )
         joined = jax.tree.map(lambda a, b: a or b, state_f, next_f)
@@ -175,66 +211,14 @@ def scan_batch(
             lambda x, new, old: spread(x, runs) if new and not old else x, state, joined, state_f
         )
         state_f = joined
-    flags_out: list[Any] = []
 
-    def scanned(state: Any, arrival: Any) -> tuple[Any, Any]:
-        (state, seen), (_, seen_f) = vmap_last(
-            body, (params_f, state_f, arrival_f), force=(state_f, None)
-        )(params, state, arrival)
-        flags_out.append(seen_f)
-        return state, seen
-
-    state, seen = lax.scan(scanned, state, arrivals)
-    return (seen, flags_out[-1]), (state, state_f)
-
-
-@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices"))
-def _run_batch(
-    estimator: Estimator,
-    inputs: Any,
-    t0: Any,
-    keys: Any,
-    flags: Frozen,
-    clock: Clock,
-    observe: Observer | None,
-    devices: int,
-) -> Any:
-    params, measurements, prior, times = inputs
-    dtype = float_dtype(measurements.value)
-    runs = measurements.value.shape[0]
-    measurements = runs_last(_in_dtype(measurements, dtype), flags.tree[1])
-    times = None if times is None else jnp.asarray(times, dtype)
-    others = runs_last((params, prior, times), (flags.tree[0], flags.tree[2], flags.tree[3]))
-    inputs = (others[0], measurements, others[1], others[2])
-
-    def everything(step: Step, _: Any) -> Step:
-        return step
-
-    found: list[Any] = []
-
-    def filtered(inputs: Any, keys: Any) -> Any:
-        seen, state = scan_batch(
-            estimator, inputs, flags.tree, t0, keys, clock, observe or everything
+    def arrive(state: Any, arrival: Any) -> tuple[Any, Any]:
+        (state, seen), _ = vmap_last(body, (params_f, state_f, arrival_f), force=(state_f, None))(
+            params, runs_adjacent(state, state_f), arrival
         )
-        found.append((seen[1], state[1]))
-        return (seen[0], state[0]) if observe is None else seen[0]
+        return runs_adjacent(state, state_f), seen
 
-    input_flags = (flags.tree, None if keys is None else True)
-    jax.eval_shape(filtered, inputs, keys)
-    seen_f, state_f = found[-1]
-    out_flags = (seen_f, state_f) if observe is None else seen_f
-    out = over_devices(filtered, input_flags, out_flags, devices)(inputs, keys)
-    out = runs_first(out, out_flags, runs)
-    if observe is not None:
-        return out
-    (time, mean, cov, info), state = out
-    return Trace(time, mean, cov, info, state)
-
-
-def _in_dtype(measurements: Measurement, dtype: Any) -> Measurement:
-    return Measurement(
-        jnp.asarray(measurements.time, dtype),
-        jnp.asarray(measurements.value, dtype),
-        jnp.asarray(measurements.sensor, jnp.int32),
-        jnp.asarray(measurements.mask, bool),
+    seen, state = scan_in_blocks(
+        arrive, state, arrivals, lambda seen: runs_first(seen, seen_f, runs)
     )
+    return seen, runs_first(state, state_f, runs)

@@ -24,6 +24,16 @@ def require(condition: Any, argument: str, expected: str, got: Any) -> None:
         raise ValueError(f"{argument}: expected {expected}, got {got}")
 
 
+class Shown:
+    """What `repr` says of a thing, worked out only if it is printed."""
+
+    def __init__(self, thing: Any):
+        self.thing = thing
+
+    def __str__(self) -> str:
+        return repr(self.thing)
+
+
 def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
     """Refuses an array whose shape differs; a string in `expected` stands for any length."""
     got = np.shape(x)
@@ -38,16 +48,17 @@ def finite(argument: str, x: Any) -> None:
     """Refuses a known array with NaN or infinity in it."""
     value = known(x)
     if value is not None:
-        require(_is_numeric(value), argument, "finite numbers", repr(x))
-        bad = ~np.isfinite(value)
-        require(not bad.any(), argument, "finite numbers", _first(value, bad))
+        require(_is_numeric(value), argument, "finite numbers", Shown(x))
+        if not _all_finite(value):
+            bad = ~np.isfinite(value)
+            require(not bad.any(), argument, "finite numbers", _first(value, bad))
 
 
 def positive(argument: str, x: Any) -> Any:
     """Refuses a value that is not positive; returns it."""
     value = known(x)
     if value is not None:
-        require(_is_numeric(value), argument, "a positive number", repr(x))
+        require(_is_numeric(value), argument, "a positive number", Shown(x))
         require(np.all(value > 0), argument, "a positive number", _plain(value))
     return x
 
@@ -56,7 +67,7 @@ def at_least(argument: str, x: Any, bound: float) -> Any:
     """Refuses a value below `bound`; returns it."""
     value = known(x)
     if value is not None:
-        require(_is_numeric(value), argument, f"a number >= {bound}", repr(x))
+        require(_is_numeric(value), argument, f"a number >= {bound}", Shown(x))
         require(np.all(value >= bound), argument, f"a number >= {bound}", _plain(value))
     return x
 
@@ -64,7 +75,7 @@ def at_least(argument: str, x: Any, bound: float) -> Any:
 def whole(argument: str, x: Any, bound: int) -> int:
     """Refuses anything but a Python integer >= `bound` (a size has to be known before tracing)."""
     ok = isinstance(x, int | np.integer) and not isinstance(x, bool) and x >= bound
-    require(ok, argument, f"a whole number >= {bound}", repr(x))
+    require(ok, argument, f"a whole number >= {bound}", Shown(x))
     return int(x)
 
 
@@ -148,13 +159,14 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     seen_value, seen_mask = known(value), known(mask)
     if seen_value is not None and seen_mask is not None:
         require(_is_numeric(seen_value), "measurements.value", "numbers", seen_value.dtype)
-        bad = ~np.isfinite(seen_value) & seen_mask
-        require(
-            not bad.any(),
-            "measurements.value",
-            "finite numbers where mask is True (mask out what is missing)",
-            _first(seen_value, bad),
-        )
+        if not _all_finite(seen_value):
+            bad = ~np.isfinite(seen_value) & seen_mask
+            require(
+                not bad.any(),
+                "measurements.value",
+                "finite numbers where mask is True (mask out what is missing)",
+                _first(seen_value, bad),
+            )
     seen_sensor = known(sensor)
     if seen_sensor is not None:
         require(seen_sensor.min() >= 0, "measurements.sensor", "indices >= 0", seen_sensor.min())
@@ -203,6 +215,12 @@ def report_times(times: Any, steps: int) -> None:
 
 def _is_numeric(value: np.ndarray) -> bool:
     return jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
+
+
+def _all_finite(value: np.ndarray) -> bool:
+    """One fast pass: False may also mean that the sum overflows."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(value)))
 
 
 def _plain(value: np.ndarray) -> Any:

@@ -6,11 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
+from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import Literal
 from jax.sharding import Mesh, PartitionSpec
 
 from ewif_jax import checks
+from ewif_jax.kernels.batched import turned
 
 
 def vmap_last(
@@ -54,35 +56,105 @@ def dependent(jaxpr: Any, flags: list[bool]) -> list[bool]:
 
 def runs_last(tree: Any, flags: Any) -> Any:
     """The flagged leaves with their leading axis moved to the end."""
-    return jax.tree.map(lambda x, f: jnp.moveaxis(jnp.asarray(x), 0, -1) if f else x, tree, flags)
+
+    def trailing(x: Any, flag: bool) -> Any:
+        if not flag or jnp.ndim(x) == 1:
+            return x
+        x = jnp.asarray(x)
+        return turned(x.reshape(x.shape[0], -1)).reshape(*x.shape[1:], -1)
+
+    return jax.tree.map(trailing, tree, flags)
 
 
 def runs_first(tree: Any, flags: Any, runs: int) -> Any:
     """Every leaf with the run axis in front, repeated where it was shared."""
+
+    def leading(x: Array, flag: bool) -> Array:
+        if not flag:
+            return jnp.broadcast_to(x, (runs, *x.shape))
+        if x.ndim == 1:
+            return x
+        return turned(x.reshape(-1, runs)).reshape(runs, *x.shape[:-1])
+
+    return jax.tree.map(leading, tree, flags)
+
+
+def runs_adjacent(tree: Any, flags: Any) -> Any:
+    """The flagged leaves with the runs adjacent in memory, which the compiler may see otherwise."""
     return jax.tree.map(
-        lambda x, f: jnp.moveaxis(x, -1, 0) if f else jnp.broadcast_to(x, (runs, *x.shape)),
+        lambda x, f: with_layout_constraint(x, Layout(tuple(range(x.ndim)))) if f else x,
         tree,
         flags,
     )
 
 
-def over_devices(
-    fn: Callable[..., Any], flags: tuple, out_flags: Any, devices: int
-) -> Callable[..., Any]:
-    """`fn` with the runs (last axis of the flagged leaves) split over the local devices."""
+def scan_in_blocks(
+    step: Callable[[Any, Any], tuple[Any, Any]],
+    state: Any,
+    arrivals: Any,
+    finish: Callable[[Any], Any],
+) -> tuple[Any, Any]:
+    """`lax.scan` of `step`, and `finish` of what it stacks: `finish` moves the stacked axis from
+    the front to place 1.
+
+    The stack is finished a block of steps at a time, while it is in the cache, and put where it
+    belongs.
+    """
+    steps = jax.tree.leaves(arrivals)[0].shape[0]
+    block = _block(steps)
+    if block == steps:
+        state, seen = lax.scan(step, state, arrivals)
+        return finish(seen), state
+    arrivals = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), arrivals)
+
+    def several(state: Any, arrivals: Any) -> tuple[Any, Any]:
+        state, seen = lax.scan(step, state, arrivals)
+        return state, finish(seen)
+
+    one = jax.tree.map(lambda x: x[0], arrivals)
+    shapes = jax.eval_shape(several, state, one)[1]
+    whole = jax.tree.map(lambda x: jnp.zeros((x.shape[0], steps, *x.shape[2:]), x.dtype), shapes)
+
+    def put(carry: Any, numbered: Any) -> tuple[Any, None]:
+        state, whole = carry
+        number, arrivals = numbered
+        state, seen = several(state, arrivals)
+        whole = jax.tree.map(
+            lambda x, new: lax.dynamic_update_slice_in_dim(x, new, number * block, 1), whole, seen
+        )
+        return (state, whole), None
+
+    (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), arrivals))
+    return whole, state
+
+
+def _block(steps: int) -> int:
+    """The largest divisor of `steps` up to 64, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 64) + 1) if steps % d == 0)
+    return best if best >= 16 else steps
+
+
+def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable[..., Any]:
+    """`fn` with the runs split over the local devices: the last axis of the flagged leaves that go
+    in, the first of all that come out."""
     if devices == 1:
         return fn
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
 
     def call(*args: Any) -> Any:
-        specs = jax.tree.map(lambda x, f: _spec(jnp.ndim(x) - 1, f), args, flags)
-        out = jax.eval_shape(fn, *args)
-        out_specs = jax.tree.map(lambda x, f: _spec(len(x.shape) - 1, f), out, out_flags)
-        return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=out_specs, check_vma=False)(
-            *args
+        specs = jax.tree.map(
+            lambda x, f: PartitionSpec(*[None] * (jnp.ndim(x) - 1), "runs") if f else _SHARED,
+            args,
+            flags,
         )
+        return jax.shard_map(
+            fn, mesh=mesh, in_specs=specs, out_specs=PartitionSpec("runs"), check_vma=False
+        )(*args)
 
     return call
+
+
+_SHARED = PartitionSpec()
 
 
 def device_count(runs: int, devices: int | None) -> int:
@@ -115,7 +187,3 @@ class Frozen:
 def spread(x: Array, runs: int) -> Array:
     """`x` repeated along a new last axis."""
     return jnp.broadcast_to(x[..., None], (*x.shape, runs))
-
-
-def _spec(last: int, flag: bool) -> PartitionSpec:
-    return PartitionSpec(*([None] * last), "runs") if flag else PartitionSpec()

@@ -5,18 +5,16 @@ A score is a function (step, truth (k,), mask (m,)) -> () of one run after one a
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.consistency import nees, nis
-from ewif_jax.batch import Step, check_runs, flagged, scan_batch
-from ewif_jax.estimator import Clock, cast, float_dtype
-from ewif_jax.layout import Frozen, device_count, over_devices, runs_last
+from ewif_jax.batch import Observer, Step, run_batch
+from ewif_jax.estimator import Clock, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]
@@ -96,19 +94,21 @@ def scored(
     checks.shape("truth", truth, (*lead, "k"))
     same = truth.shape[-2] == steps and (truth.ndim == 2 or truth.shape[0] == runs)
     checks.require(same, "truth", f"{runs} runs and {steps} arrivals", f"shape {truth.shape}")
-    inputs, flags = flagged(params, params_per_run, measurements, prior, times)
-    check_runs(estimator, inputs, flags, t0, clock, key)
-    keys = None if key is None else key if jnp.ndim(key) == 1 else jax.random.split(key, runs)
-    return _scored(
+    mask = jnp.asarray(measurements.mask, bool)
+    return run_batch(
         estimator,
-        inputs,
-        truth,
-        t0,
-        keys,
-        Frozen((flags, truth.ndim == 3)),
-        clock,
-        tuple(scores.items()),
-        device_count(runs, devices),
+        params,
+        measurements,
+        prior=prior,
+        t0=t0,
+        times=times,
+        clock=clock,
+        key=key,
+        params_per_run=params_per_run,
+        observe=_all_of(tuple(scores.items())),
+        context=(truth.astype(float_dtype(measurements.value)), mask),
+        context_per_run=(truth.ndim == 3, mask.ndim == 3),
+        devices=devices,
     )
 
 
@@ -120,47 +120,15 @@ def average(values: Array, axis: int | None = None) -> Array:
     return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
 
 
-@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "scores", "devices"))
-def _scored(
-    estimator: Estimator,
-    inputs: Any,
-    truth: Array,
-    t0: Any,
-    keys: Any,
-    flags: Frozen,
-    clock: Clock,
-    scores: tuple[tuple[str, Score], ...],
-    devices: int,
-) -> dict[str, Array]:
-    input_f, truth_f = flags.tree
-    params, measurements, prior, times = inputs
-    dtype = float_dtype(measurements.value)
-    mask = jnp.asarray(measurements.mask, bool)
-    wide = measurements._replace(mask=mask if input_f[1].mask else mask[None])
-    measurements = cast(wide, dtype)._replace(mask=mask)
-    inputs = (params, measurements, prior, None if times is None else jnp.asarray(times, dtype))
-    inputs = runs_last(inputs, input_f)
-    truth = runs_last(jnp.asarray(truth, dtype), truth_f)
+@cache
+def _all_of(scores: tuple[tuple[str, Score], ...]) -> Observer:
+    """The observer of several scores by name; one object for equal scores, so that nothing is
+    compiled again."""
 
     def observe(step: Step, seen: tuple[Array, Array]) -> dict[str, Array]:
         return {name: score(step, *seen) for name, score in scores}
 
-    def filtered(inputs: Any, keys: Any, truth: Array) -> dict[str, Array]:
-        context, context_f = (truth, inputs[1].mask), (truth_f, input_f[1].mask)
-        (seen, seen_f), _ = scan_batch(
-            estimator, inputs, input_f, t0, keys, clock, observe, context, context_f
-        )
-        count = inputs[1].value.shape[-1]
-        return jax.tree.map(
-            lambda x, f: x if f else jnp.broadcast_to(x[:, None], (x.shape[0], count)),
-            seen,
-            seen_f,
-        )
-
-    in_f = (input_f, None if keys is None else True, truth_f)
-    out_f = {name: True for name, _ in scores}
-    out = over_devices(filtered, in_f, out_f, devices)(inputs, keys, truth)
-    return jax.tree.map(lambda x: x.T, out)
+    return observe
 
 
 def _used(step: Step) -> Array:

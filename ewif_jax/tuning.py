@@ -137,8 +137,8 @@ def tune(
         "loss": np.asarray(jnp.stack(losses)),
         "params": jax.tree.map(lambda *leaves: np.stack(leaves), *trail),
     }
-    final = float(objective(free, draw))
-    return Tuned(constrain(free), final, history)
+    *_, final, params = advance(free, state, draw)
+    return Tuned(params, float(final), history)
 
 
 def rmse_loss(estimator: Estimator, measurements: Measurement, truth: Any, **setting: Any) -> Loss:
@@ -199,8 +199,10 @@ def _squared_log(ratio: Array) -> Array:
 
 
 def _as_float(x: Any) -> Array:
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.asarray(0.0).dtype)
+    dtype = jnp.asarray(x).dtype
+    floating = jnp.issubdtype(dtype, jnp.floating)
+    # Named, so that no type is weak: it would turn strong in the first step, and compile again.
+    return jnp.asarray(x, dtype if floating else jnp.asarray(0.0).dtype)
 
 
 def _default_transform(x: Array) -> Transform:

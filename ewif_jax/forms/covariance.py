@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import verdict
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
@@ -60,15 +60,13 @@ def covariance_form(
     ) -> tuple[CovarianceState, Info]:
         late = measurement.time < state.time
         present = jnp.any(measurement.mask)
-        mean, cov, info = measure(model, params, state.mean, state.cov, measurement)
-        updated = CovarianceState(state.time, mean, cov)
-        used = present & ~late
+        used = measurement._replace(mask=measurement.mask & ~late)
+        mean, cov, info = measure(model, params, state.mean, state.cov, used)
         info = info._replace(
-            log_likelihood=jnp.where(used, info.log_likelihood, 0),
             delay=state.time - measurement.time,
             status=verdict(late, present),
         )
-        return choose(used, updated, state), info
+        return CovarianceState(state.time, mean, cov), info
 
     def estimate(params: Any, state: CovarianceState) -> Gaussian:
         del params

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.core import ShapedArray
+from jax.experimental.layout import Layout, with_layout_constraint
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -60,6 +61,18 @@ def stage(fn: Function, *args: Array, batch: int) -> Any:
     kernel read is computed once."""
     out = _kernel_p.bind(*args, fn=fn, batch=batch)
     return tuple(out) if len(out) > 1 else out[0]
+
+
+def turned(x: Array) -> Array:
+    """The transpose of a matrix, as a pass of its own: fused with its neighbours it is slow."""
+    return stage(_turned, x, batch=1)
+
+
+def _turned(x: Array) -> Array:
+    return with_layout_constraint(jnp.swapaxes(x, 0, 1), Layout(tuple(range(x.ndim))))
+
+
+_ADJOINTS[_turned] = _turned
 
 
 def _flat(fn: Function) -> Callable[..., Sequence[Array]]:

@@ -59,13 +59,12 @@ def update(
     (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
     result of the first, which is what makes the Joseph form forget rounding errors of the gain.
     """
-    full = symmetric.unpack(packed)
-    cross = matmul(H, full)
+    cross = symmetric.rows(H, packed)
     innovation = innovate(difference, cross, matmul(cross, H.T) + R, mask)
     weights = cholesky.solved(innovation.cov, innovation.cross)
     mean = _moved(mean, weights, innovation.value)
-    half = _reduced(full, innovation.cross, weights)
-    packed = _joseph(half, matmul(H, half), mask_cov(R, mask), weights)
+    half = _reduced(packed, innovation.cross, weights)
+    packed = _joseph(half, symmetric.rows(H, half), mask_cov(R, mask), weights)
     return mean, packed, innovation
 
 
@@ -76,19 +75,18 @@ def _moved(mean: Array, weights: Array, value: Array) -> Array:
 
 
 @kernel
-def _reduced(full: Array, cross: Array, weights: Array) -> Array:
-    """P - P H' K'."""
-    return full - _contract(cross[:, :, None], weights[:, None, :])
+def _reduced(packed: Array, cross: Array, weights: Array) -> Array:
+    """P - P H' K', packed."""
+    rows, cols = np.triu_indices(cross.shape[1])
+    return packed - _contract(cross[:, rows], weights[:, cols])
 
 
 @kernel
 def _joseph(half: Array, seen: Array, R: Array, weights: Array) -> Array:
     """half + K (R K' - H half), packed; `seen` = H half."""
-    n = half.shape[0]
-    rows, cols = np.triu_indices(n)
+    rows, cols = np.triu_indices(weights.shape[1])
     correction = _contract(R[:, :, None], weights[:, None, :]) - seen
-    upper = half.reshape(n * n, *half.shape[2:])[rows * n + cols]
-    return upper + _contract(weights[:, rows], correction[:, cols])
+    return half + _contract(weights[:, rows], correction[:, cols])
 
 
 def _contract(a: Array, b: Array) -> Array:

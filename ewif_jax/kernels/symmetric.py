@@ -75,6 +75,11 @@ def congruence(a: Array, packed: Array) -> Array:
     return _congruence(a, packed)
 
 
+def rows(a: Array, packed: Array) -> Array:
+    """a P (m, n) for a matrix a (m, n) and a packed P."""
+    return _rows(a, packed)
+
+
 def times(packed: Array, x: Array) -> Array:
     """P x (n,) for a packed P."""
     return _times(packed, x)
@@ -144,9 +149,20 @@ def _times(packed: Array, x: Array) -> Array:
 
 
 @kernel
+def _rows(a: Array, packed: Array) -> Array:
+    n = a.shape[1]
+    where = places(n)
+    columns = [total(a[:, k] * packed[where[k, j]][None] for k in range(n)) for j in range(n)]
+    return jnp.stack(columns, 1)
+
+
+@kernel
 def _congruence(a: Array, packed: Array) -> Array:
     n, batch = a.shape[0], packed.ndim - 1
     rows, cols = np.triu_indices(n)
+    if batch == 0:
+        half = lax.dot(a, _spread(packed), precision=lax.Precision.HIGHEST)
+        return _pick(lax.dot(half, a.T, precision=lax.Precision.HIGHEST))
     if a.size > n * n:
         half = stage(_left, a, packed, batch=batch)
         return total(half[rows, k] * a[cols, k] for k in range(n))
