@@ -1,18 +1,18 @@
 """Runs as the last axis: mapping over it, following what depends on it, splitting it up."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import Literal
 from jax.sharding import Mesh, PartitionSpec
 
 from ewif_jax import checks
-from ewif_jax.kernels.batched import turned
+from ewif_jax.kernels.batched import contiguous, turned
 
 
 def vmap_last(
@@ -80,12 +80,8 @@ def runs_first(tree: Any, flags: Any, runs: int) -> Any:
 
 
 def runs_adjacent(tree: Any, flags: Any) -> Any:
-    """The flagged leaves with the runs adjacent in memory, which the compiler may see otherwise."""
-    return jax.tree.map(
-        lambda x, f: with_layout_constraint(x, Layout(tuple(range(x.ndim)))) if f else x,
-        tree,
-        flags,
-    )
+    """The flagged leaves with the runs adjacent in memory."""
+    return jax.tree.map(lambda x, f: contiguous(x) if f else x, tree, flags)
 
 
 def scan_in_blocks(
@@ -107,6 +103,7 @@ def scan_in_blocks(
         return finish(seen), state
     arrivals = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), arrivals)
 
+    @partial(jax.checkpoint, prevent_cse=False)
     def several(state: Any, arrivals: Any) -> tuple[Any, Any]:
         state, seen = lax.scan(step, state, arrivals)
         return state, finish(seen)

@@ -137,18 +137,22 @@ def _sight(
 
 def _gained(seen: Array, difference: Array, R: Array, mask: Array) -> tuple[Array, Array]:
     noise = cholesky.factor(gaussian.mask_cov(R, mask))
-    white = cholesky.forward(noise, jnp.concatenate([seen, difference[:, None]], 1))
-    return _squares(white)
+    rows = cholesky.forward(noise, seen)
+    # Apart from the vector, the matrix depends on no data: a batch of runs may share it.
+    return _squares(rows), _products(rows, cholesky.forward(noise, difference))
 
 
 @kernel
-def _squares(white: Array) -> tuple[Array, Array]:
-    """Packed rows' rows, and rows' target, of white = (rows, target)."""
-    rows, target = white[:, :-1], white[:, -1]
+def _squares(rows: Array) -> Array:
+    """rows' rows, packed."""
     i, j = np.triu_indices(rows.shape[1])
-    return total(r[i] * r[j] for r in rows), total(
-        r * t[None] for r, t in zip(rows, target, strict=True)
-    )
+    return total(r[i] * r[j] for r in rows)
+
+
+@kernel
+def _products(rows: Array, target: Array) -> Array:
+    """rows' target."""
+    return total(r * t[None] for r, t in zip(rows, target, strict=True))
 
 
 def _info(

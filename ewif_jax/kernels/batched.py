@@ -25,6 +25,8 @@ from jax.interpreters import ad, batching, mlir
 Function = Callable[..., Any]
 _ADJOINTS: dict[Function, Function] = {}
 _CHEAP: set[Function] = set()
+_APART: set[Function] = set()
+"""Kept as functions of their own even without a batch."""
 
 
 def kernel(fn: Function) -> Function:
@@ -63,16 +65,22 @@ def stage(fn: Function, *args: Array, batch: int) -> Any:
     return tuple(out) if len(out) > 1 else out[0]
 
 
+def contiguous(x: Array) -> Array:
+    """`x`, its last axis adjacent in memory, which the compiler may see otherwise."""
+    return with_layout_constraint(x, Layout(tuple(range(x.ndim))))
+
+
 def turned(x: Array) -> Array:
     """The transpose of a matrix, as a pass of its own: fused with its neighbours it is slow."""
-    return stage(_turned, x, batch=1)
+    return stage(_turned, x, batch=0)
 
 
 def _turned(x: Array) -> Array:
-    return with_layout_constraint(jnp.swapaxes(x, 0, 1), Layout(tuple(range(x.ndim))))
+    return contiguous(jnp.swapaxes(x, 0, 1))
 
 
 _ADJOINTS[_turned] = _turned
+_APART.add(_turned)
 
 
 def _flat(fn: Function) -> Callable[..., Sequence[Array]]:
@@ -107,7 +115,7 @@ def _inline(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
 
 
 def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
-    if batch == 0 or fn in _CHEAP:
+    if fn in _CHEAP or (batch == 0 and fn not in _APART):
         return _flat(fn)(*args)
     with set_xla_metadata(inlineable="false"):
         return _jitted(fn)(*args)

@@ -13,7 +13,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ewif_jax.kernels.batched import stage, total
+from ewif_jax.kernels.batched import contiguous, stage, total
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -36,9 +36,10 @@ def fence(x: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    if a.size * b.shape[1] <= 128:  # calling a library takes longer
+    if a.size * b.shape[1] <= 256:  # calling a library takes longer
         return _sum_of_products(a, b)
-    return lax.dot(a, b, precision=lax.Precision.HIGHEST)
+    # A transposed factor would take a slower library.
+    return lax.dot(contiguous(a), b, precision=lax.Precision.HIGHEST)
 
 
 def _abstract(a, b):

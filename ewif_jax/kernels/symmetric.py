@@ -161,8 +161,8 @@ def _congruence(a: Array, packed: Array) -> Array:
     n, batch = a.shape[0], packed.ndim - 1
     rows, cols = np.triu_indices(n)
     if batch == 0:
-        half = lax.dot(a, _spread(packed), precision=lax.Precision.HIGHEST)
-        return _pick(lax.dot(half, a.T, precision=lax.Precision.HIGHEST))
+        half = _left(a, packed)
+        return _pick(total(half[:, k, None] * a[None, :, k] for k in range(n)))
     if a.size > n * n:
         half = stage(_left, a, packed, batch=batch)
         return total(half[rows, k] * a[cols, k] for k in range(n))
