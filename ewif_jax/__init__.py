@@ -5,7 +5,16 @@ of measurements in arrival order go into `run`; `monte_carlo` and `tune` build o
 """
 
 from ewif_jax import models, scenarios, scores
+from ewif_jax.analysis.anderson import (
+    actual_error,
+    error_bounds,
+    steady_state,
+    weighted_covariances,
+    weighting_as_process_noise,
+)
+from ewif_jax.analysis.anderson_continuous import steady_state_continuous, weighting_as_input_noise
 from ewif_jax.analysis.consistency import chi2_band, nees, nis, rmse
+from ewif_jax.analysis.crlb import crlb
 from ewif_jax.analysis.equivalence import Case, equivalent_process_noise, equivalent_tau
 from ewif_jax.analysis.expected import expected_mse
 from ewif_jax.analysis.merit import (
@@ -19,8 +28,13 @@ from ewif_jax.analysis.merit import (
     random_walk_gain,
     steady_state_gain,
 )
+from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
+from ewif_jax.analysis.storage import storage
 from ewif_jax.batch import run_batch
+from ewif_jax.continuous.kalman_bucy import kalman_bucy
 from ewif_jax.estimator import run, step, stream
+from ewif_jax.estimators.bootstrap import bootstrap
+from ewif_jax.estimators.ensemble import ensemble
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
@@ -28,6 +42,8 @@ from ewif_jax.estimators.information import information
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
+from ewif_jax.estimators.unscented import unscented
+from ewif_jax.forms.ensembles import fuse_ensembles
 from ewif_jax.models import Model, linear_model
 from ewif_jax.monte_carlo import (
     Scenario,
@@ -42,7 +58,13 @@ from ewif_jax.oosm.asd import asd
 from ewif_jax.oosm.b1 import b1
 from ewif_jax.oosm.bl1 import bl1
 from ewif_jax.oosm.drop_late import drop_late
+from ewif_jax.oosm.enkf1 import enkf1
+from ewif_jax.oosm.enkf2 import enkf2
+from ewif_jax.oosm.pf_extended import pf_extended
+from ewif_jax.oosm.pf_fixed_point import pf_fixed_point
+from ewif_jax.oosm.pf_retrodict import pf_retrodict
 from ewif_jax.oosm.replay import replay
+from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
 from ewif_jax.parallel import run_parallel
 from ewif_jax.smoothers.batch_wls import batch_wls
@@ -80,6 +102,7 @@ __all__ = [
     "Transform",
     "Tuned",
     "a1",
+    "actual_error",
     "al1",
     "alpha_beta_eigenvalues",
     "alpha_beta_gains",
@@ -87,21 +110,29 @@ __all__ = [
     "b1",
     "batch_wls",
     "bl1",
+    "bootstrap",
     "chi2_band",
+    "crlb",
     "cutoff_delay",
     "delayed_gain",
     "drop_late",
+    "enkf1",
+    "enkf2",
+    "ensemble",
     "equivalent_process_noise",
     "equivalent_tau",
+    "error_bounds",
     "ewif",
     "expected_mse",
     "extended",
     "fading",
     "fixed_lag",
     "fixed_lag_ewif",
+    "fuse_ensembles",
     "gain_history",
     "information",
     "kalman",
+    "kalman_bucy",
     "likelihood_loss",
     "limited_memory",
     "linear_model",
@@ -112,6 +143,12 @@ __all__ = [
     "nees_loss",
     "nis",
     "nis_loss",
+    "pcrlb",
+    "pcrlb_equivalent",
+    "pcrlb_late",
+    "pf_extended",
+    "pf_fixed_point",
+    "pf_retrodict",
     "positive",
     "prediction_loss",
     "psd",
@@ -121,6 +158,7 @@ __all__ = [
     "rmse",
     "rmse_loss",
     "rts",
+    "rts_reference",
     "run",
     "run_batch",
     "run_parallel",
@@ -130,10 +168,17 @@ __all__ = [
     "selective",
     "simulate_batch",
     "square_root",
+    "steady_state",
+    "steady_state_continuous",
     "steady_state_gain",
     "step",
+    "storage",
     "stream",
     "tune",
     "two_sided_ewif",
     "unconstrained",
+    "unscented",
+    "weighted_covariances",
+    "weighting_as_input_noise",
+    "weighting_as_process_noise",
 ]

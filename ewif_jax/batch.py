@@ -20,6 +20,9 @@ from ewif_jax.layout import (
     Frozen,
     broadcast_prefix,
     device_count,
+    first_run,
+    group_size,
+    in_groups,
     over_devices,
     runs_adjacent,
     runs_first,
@@ -93,7 +96,7 @@ def run_batch(
         None if key is None else True,
         broadcast_prefix(context_per_run, context),
     )
-    keys = None if key is None else key if jnp.ndim(key) == 1 else jax.random.split(key, runs)
+    keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
     return _run_batch(
         estimator,
         (*inputs, keys, context),
@@ -103,6 +106,11 @@ def run_batch(
         observe,
         device_count(runs, devices),
     )
+
+
+def _one_for_each(key: Any) -> bool:
+    """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
+    return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
 
 
 def flagged(
@@ -128,18 +136,11 @@ def check_runs(
     estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, key: Any
 ) -> None:
     """Refuses what `run` refuses, with the first run for all and the largest sensor of any run."""
-    first = jax.tree.map(_first_run, inputs, flags)
+    first = first_run(inputs, flags)
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
         first = (first[0], first[1]._replace(sensor=sensors.max(0)), *first[2:])
     validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
-
-
-def _first_run(x: Any, flag: bool) -> Any:
-    if not flag:
-        return x
-    known = checks.known(x)
-    return x[0] if known is None else known[0]
 
 
 @partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices"))
@@ -158,10 +159,21 @@ def _run_batch(
         time=jnp.asarray(measurements.time, dtype), value=jnp.asarray(measurements.value, dtype)
     )
     times = None if times is None else jnp.asarray(times, dtype)
-    inputs = runs_last((params, measurements, prior, times, keys, context), flags.tree)
+    inputs = (params, measurements, prior, times, keys, context)
 
     def filtered(*inputs: Any) -> Any:
-        return _scanned(estimator, inputs, flags.tree, t0, clock, observe or _everything)
+        runs = inputs[1].value.shape[0]
+        size = group_size(runs, _state_bytes(estimator, inputs, flags.tree, t0))
+
+        def together(inputs: Any) -> Any:
+            inputs, found = (
+                (first_run(inputs, flags.tree), jax.tree.map(lambda _: False, flags.tree))
+                if size == 1
+                else (runs_last(inputs, flags.tree), flags.tree)
+            )
+            return _scanned(estimator, inputs, found, size, t0, clock, observe or _everything)
+
+        return in_groups(together, inputs, flags.tree, runs, size)
 
     seen, state = over_devices(filtered, flags.tree, devices)(*inputs)
     if observe is not None:
@@ -170,19 +182,35 @@ def _run_batch(
     return Trace(time, mean, cov, info, state)
 
 
+def _state_bytes(estimator: Estimator, inputs: Any, flags: Any, t0: Any) -> int:
+    """What the state of one run takes in memory."""
+
+    def start(inputs: Any) -> Any:
+        params, measurements, prior, _, key, _ = first_run(inputs, flags)
+        return initial(estimator, params, prior, t0, measurements.value.dtype, key)
+
+    leaves = jax.tree.leaves(jax.eval_shape(start, inputs))
+    return sum(x.size * x.dtype.itemsize for x in leaves)
+
+
 def _everything(step: Step, context: Any) -> Step:
     del context
     return step
 
 
 def _scanned(
-    estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, observe: Observer
+    estimator: Estimator,
+    inputs: Any,
+    flags: Any,
+    runs: int,
+    t0: Any,
+    clock: Clock,
+    observe: Observer,
 ) -> tuple[Any, Any]:
     """Observations (R, T, ...) and final states (R, ...) from inputs with the runs last."""
     params, measurements, prior, times, keys, context = inputs
     params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
     dtype = measurements.value.dtype
-    runs = measurements.value.shape[-1]
 
     def start(params: Any, prior: Any, key: Any) -> Any:
         return initial(estimator, params, prior, t0, dtype, key)

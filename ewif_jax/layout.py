@@ -54,6 +54,16 @@ def dependent(jaxpr: Any, flags: list[bool]) -> list[bool]:
     return [not isinstance(v, Literal) and v in tainted for v in jaxpr.outvars]
 
 
+def first_run(tree: Any, flags: Any) -> Any:
+    """The first along the leading axis of the flagged leaves; NumPy stays NumPy, known known."""
+
+    def first(x: Any, flag: bool) -> Any:
+        known = checks.known(x) if flag and not _is_key(x) else None
+        return x if not flag else x[0] if known is None else known[0]
+
+    return jax.tree.map(first, tree, flags)
+
+
 def runs_last(tree: Any, flags: Any) -> Any:
     """The flagged leaves with their leading axis moved to the end."""
 
@@ -81,7 +91,11 @@ def runs_first(tree: Any, flags: Any, runs: int) -> Any:
 
 def runs_adjacent(tree: Any, flags: Any) -> Any:
     """The flagged leaves with the runs adjacent in memory."""
-    return jax.tree.map(lambda x, f: contiguous(x) if f else x, tree, flags)
+
+    def adjacent(x: Array, flag: bool) -> Array:
+        return contiguous(x) if flag and not _is_key(x) else x  # keys have no layout of their own
+
+    return jax.tree.map(adjacent, tree, flags)
 
 
 def scan_in_blocks(
@@ -131,27 +145,43 @@ def _block(steps: int) -> int:
     return best if best >= 16 else steps
 
 
+def group_size(runs: int, state_bytes: int) -> int:
+    """How many runs to filter at once: a divisor of `runs` for which the states stay in the cache,
+    or 1 where that would leave too few to fill vectors (a state that large is a vector itself)."""
+    room = max(_CACHE // max(state_bytes, 1), 1)
+    best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
+    return best if best >= 16 or room >= runs else 1 if room < 16 else runs
+
+
+_CACHE = 2**19
+
+
+def in_groups(fn: Callable[[Any], Any], inputs: Any, flags: Any, runs: int, size: int) -> Any:
+    """`fn` of `size` runs at a time: the leading axis of the flagged leaves that go in, and of all
+    that come out."""
+    if size == runs:
+        return fn(inputs)
+    leaves, tree = jax.tree.flatten(inputs)
+    marked = jax.tree.leaves(flags)
+    split = [x.reshape(-1, size, *x.shape[1:]) for x, f in zip(leaves, marked, strict=True) if f]
+
+    def one(group: list[Array]) -> Any:
+        some = iter(group)
+        mixed = [next(some) if f else x for x, f in zip(leaves, marked, strict=True)]
+        return fn(jax.tree.unflatten(tree, mixed))
+
+    return jax.tree.map(lambda x: x.reshape(runs, *x.shape[2:]), lax.map(one, split))
+
+
 def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable[..., Any]:
-    """`fn` with the runs split over the local devices: the last axis of the flagged leaves that go
-    in, the first of all that come out."""
+    """`fn` with the runs split over the local devices: the leading axis of the flagged leaves that
+    go in, and of all that come out."""
     if devices == 1:
         return fn
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
-
-    def call(*args: Any) -> Any:
-        specs = jax.tree.map(
-            lambda x, f: PartitionSpec(*[None] * (jnp.ndim(x) - 1), "runs") if f else _SHARED,
-            args,
-            flags,
-        )
-        return jax.shard_map(
-            fn, mesh=mesh, in_specs=specs, out_specs=PartitionSpec("runs"), check_vma=False
-        )(*args)
-
-    return call
-
-
-_SHARED = PartitionSpec()
+    split, shared = PartitionSpec("runs"), PartitionSpec()
+    specs = jax.tree.map(lambda f: split if f else shared, flags)
+    return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
 
 
 def device_count(runs: int, devices: int | None) -> int:
@@ -184,3 +214,7 @@ class Frozen:
 def spread(x: Array, runs: int) -> Array:
     """`x` repeated along a new last axis."""
     return jnp.broadcast_to(x[..., None], (*x.shape, runs))
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key)

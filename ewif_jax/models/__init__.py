@@ -1,5 +1,6 @@
 """The physical world, written once for all filters: how a state moves and what a sensor sees."""
 
+from ewif_jax.models.coordinated_turn import coordinated_turn
 from ewif_jax.models.kinematic import (
     constant_acceleration,
     constant_velocity,
@@ -26,6 +27,7 @@ __all__ = [
     "bearing_sensor",
     "constant_acceleration",
     "constant_velocity",
+    "coordinated_turn",
     "flow",
     "linear_model",
     "observation",

@@ -6,8 +6,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
-from ewif_jax.kernels import gaussian, retrodiction
+from ewif_jax.estimator import verdict
+from ewif_jax.kernels import gaussian, retrodiction, slots
+from ewif_jax.kernels.batched import kernel, total
+from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -15,13 +17,13 @@ from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 class JointState(NamedTuple):
     """time (); used (): whether this time has taken a measurement; newest first, times (L,),
-    means (L, n) and covs (L, L, n, n): covs[i, j] is the covariance of x(i) with x(j)."""
+    means (L, n) and cov (L n, L n): the joint covariance."""
 
     time: Array
     used: Array
     times: Array
     means: Array
-    covs: Array
+    cov: Array
 
 
 def asd(model: Model, lag: int) -> Estimator:
@@ -60,7 +62,7 @@ def asd(model: Model, lag: int) -> Estimator:
         ValueError: lag < 1; `init` with `prior=None`.
     """
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
-    slots = checks.whole("lag", lag, 1) + 1
+    count = checks.whole("lag", lag, 1) + 1
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> JointState:
         del params, key
@@ -69,113 +71,149 @@ def asd(model: Model, lag: int) -> Estimator:
         mean = jnp.asarray(prior.mean)
         cov = jnp.asarray(prior.cov, mean.dtype)
         time = jnp.asarray(t0, mean.dtype)
-        covs = jnp.stack([jnp.stack([cov] * slots)] * slots)
-        times, means = jnp.stack([time] * slots), jnp.stack([mean] * slots)
-        return JointState(time, jnp.asarray(False), times, means, covs)
+        times, means = jnp.stack([time] * count), jnp.stack([mean] * count)
+        return JointState(time, jnp.asarray(False), times, means, jnp.tile(cov, (count, count)))
 
     def predict(params: Any, state: JointState, time: Array) -> JointState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
         mean, F, Q = flow(model, params, state.means[0], state.time, ahead)
-        row = jnp.einsum("ab,jbc->jac", F, state.covs[0])
+        n = mean.shape[0]
+        row = matmul(F, state.cov[:n])
+        own = matmul(row[:, :n], F.T) + Q
         left = ahead > state.time
-        now = jnp.zeros((), jnp.int32)
-        own = row[0] @ F.T + Q
-        moved = _placed(state, now, left & state.used, ahead, mean, row, own)
+        first = jnp.arange(count) == 0
+        moved = _placed(state, first, ~first & left & state.used, ahead, mean, row, own)
         known = time >= state.time
         return moved._replace(
             time=time,
             used=state.used & ~left,
             means=jnp.where(known, moved.means, jnp.nan),
-            covs=jnp.where(known, moved.covs, jnp.nan),
+            cov=jnp.where(known, moved.cov, jnp.nan),
         )
 
     def update(params: Any, state: JointState, measurement: Measurement) -> tuple[JointState, Info]:
-        mask = measurement.mask
         newer = jnp.sum(state.times > measurement.time)
-        known = newer < slots
-        at = jnp.where(known, newer, 0)
-        joint = _with_time(model, params, state, at, measurement.time)
-        here = joint.covs[at]
-        predicted, H, R = sight(
-            model, params, joint.means[at], measurement.sensor, measurement.time
-        )
+        known = newer < count
+        present = jnp.any(measurement.mask)
+        usable = known & present
+        mask = measurement.mask & usable
+        at = jnp.arange(count) == jnp.where(known, newer, 0)
+        joint = _with_time(model, params, state, at, measurement.time, usable)
+        mean, row = slots.picked(joint.means, at), _row(joint.cov, at)
+        predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
-        cross = jnp.einsum("ma,jab->jmb", H, here)
-        innovation = gaussian.innovate(difference, _columns(cross), cross[at] @ H.T + R, mask)
-        gain = _blocks(gaussian.gain(innovation), slots)
-        means = joint.means + gain @ innovation.value
-        covs = _joseph(joint.covs, gain, innovation.cross, at, H, gaussian.mask_cov(R, mask))
-        updated = joint._replace(used=jnp.asarray(True), means=means, covs=covs)
+        cross = matmul(H, row)
+        own = slots.picked(cross.T.reshape(count, -1, H.shape[0]), at).T
+        innovation = gaussian.innovate(difference, cross, matmul(own, H.T) + R, mask)
+        weights = gaussian.gain(innovation).T
+        half = _reduced(joint.cov, innovation.cross, weights)
+        correction = matmul(gaussian.mask_cov(R, mask), weights) - matmul(H, _row(half, at))
+        shift = matvec(weights.T, innovation.value)
+        updated = joint._replace(
+            used=state.used | usable,
+            means=joint.means + shift.reshape(count, -1),
+            cov=_joseph(half, weights, correction),
+        )
         late = measurement.time < state.time
-        present = jnp.any(mask)
         info = Info(
             innovation.value,
             innovation.cov,
-            jnp.where(present, gaussian.log_density(innovation, mask), 0),
+            gaussian.log_density(innovation, mask),
             state.time - measurement.time,
             verdict(late, present, Status.LATE_USED),
         )
-        return choose(known & present, updated, state), too_late(info, ~known)
+        return updated, too_late(info, ~known)
 
     def estimate(params: Any, state: JointState) -> Gaussian:
         del params
-        return Gaussian(state.means[0], state.covs[0, 0])
+        n = state.means.shape[1]
+        cov = state.cov[:n, :n]
+        return Gaussian(state.means[0], (cov + cov.T) / 2)
 
     return Estimator(init, predict, update, estimate)
 
 
-def _with_time(model: Model, params: Any, state: JointState, at: Array, time: Array) -> JointState:
-    """The joint with a state of `time` in slot `at`, whose present state is the last not newer."""
-    before, after = at, jnp.maximum(at - 1, 0)
-    start, end = state.times[before], state.times[after]
+def _with_time(
+    model: Model, params: Any, state: JointState, at: Array, time: Array, usable: Array
+) -> JointState:
+    """The joint with a state of `time` in the slot `at` (L,), whose present state is the last not
+    newer; unchanged unless `usable`, or where that state is of this very time."""
+    after = jnp.concatenate([at[:1] | at[1:2], at[2:], jnp.zeros(1, bool)])
+    start, end = slots.picked(state.times, at), slots.picked(state.times, after)
+    before_mean, after_mean = slots.picked(state.means, at), slots.picked(state.means, after)
     time = jnp.clip(time, start, end)
-    there, F1, Q1 = flow(model, params, state.means[before], start, time)
+    there, F1, Q1 = flow(model, params, before_mean, start, time)
     arrived, F2, Q2 = flow(model, params, there, time, end)
     gain, left_over = retrodiction.bridge(Q1, F2, Q2)
-    rest = F1 - gain @ F2 @ F1
-    mean = there + gain @ (state.means[after] - arrived)
-    row = jnp.einsum("ab,jbc->jac", gain, state.covs[after]) + jnp.einsum(
-        "ab,jbc->jac", rest, state.covs[before]
-    )
-    own = gain @ row[after].T + rest @ row[before].T + left_over
-    return _placed(state, at, time > start, time, mean, row, own)
+    rest = F1 - matmul(matmul(gain, F2), F1)
+    mean = there + matvec(gain, after_mean - arrived)
+    row = matmul(gain, _row(state.cov, after)) + matmul(rest, _row(state.cov, at))
+    by_slot = row.T.reshape(at.shape[0], -1, row.shape[0])
+    own = matmul(gain, slots.picked(by_slot, after)) + matmul(rest, slots.picked(by_slot, at))
+    push = usable & (time > start)
+    older = jnp.cumsum(at) > at
+    return _placed(state, at & push, older & push, time, mean, row, own + left_over)
 
 
 def _placed(
-    state: JointState, at: Array, push: Array, time: Array, mean: Array, row: Array, own: Array
+    state: JointState, here: Array, older: Array, time: Array, mean: Array, row: Array, own: Array
 ) -> JointState:
-    """The joint with a new state in slot `at`: mean (n,), covariances `row` (L, n, n) with the old
-    slots and `own` (n, n). It pushes the older slots back by one, or replaces the slot."""
-    index = jnp.arange(state.times.shape[0])
-    source = jnp.where(push & (index > at), index - 1, index)
-    here = index == at
-    row = jnp.where(here[:, None, None], own[None], row[source])
-    covs = state.covs[source][:, source]
-    covs = jnp.where(here[None, :, None, None], row.transpose(0, 2, 1)[:, None], covs)
-    covs = jnp.where(here[:, None, None, None], row[None], covs)
+    """The joint with a new state in the slot `here` (L,): mean (n,), covariances `row` (n, L n)
+    with the old slots and `own` (n, n). The slots `older` (L,) take what was one slot newer."""
     return state._replace(
-        times=jnp.where(here, time, state.times[source]),
-        means=jnp.where(here[:, None], mean[None], state.means[source]),
-        covs=covs,
+        times=_replaced(state.times, time, here, older),
+        means=_replaced(state.means, mean, here, older),
+        cov=_inserted(state.cov, row, own, here, older),
     )
 
 
-def _joseph(covs: Array, gain: Array, cross: Array, at: Array, H: Array, R: Array) -> Array:
-    """(I - K H) P (I - K H)' + K R K' block by block, H looking at slot `at`; cross (m, L n)."""
-    seen = _blocks(cross.T, covs.shape[0])
-    half = covs - jnp.einsum("iam,jbm->ijab", gain, seen)
-    correction = gain @ R - half[:, at] @ H.T
-    whole = half + jnp.einsum("iam,jbm->ijab", correction, gain)
-    return (whole + whole.transpose(1, 0, 3, 2)) / 2
+def _row(cov: Array, at: Array) -> Array:
+    """The rows (n, L n) of the joint covariance that belong to the slot `at` (L,)."""
+    return slots.picked(cov.reshape(at.shape[0], -1, cov.shape[1]), at)
 
 
-def _columns(blocks: Array) -> Array:
-    """(m, L n) of (L, m, n)."""
-    return jnp.concatenate(list(blocks), 1)
+@kernel
+def _replaced(table: Array, new: Array, here: Array, older: Array) -> Array:
+    inner = (1,) * (table.ndim - here.ndim)
+
+    def wide(flags: Array) -> Array:
+        return flags.reshape(flags.shape[:1] + inner + flags.shape[1:])
+
+    moved = jnp.where(wide(older), jnp.concatenate([table[:1], table[:-1]]), table)
+    return jnp.where(wide(here), new[None], moved)
 
 
-def _blocks(rows: Array, slots: int) -> Array:
-    """(L, n, m) of (L n, m)."""
-    return rows.reshape(slots, -1, rows.shape[1])
+@kernel
+def _inserted(cov: Array, row: Array, own: Array, here: Array, older: Array) -> Array:
+    count, n, batch = here.shape[0], own.shape[0], cov.shape[2:]
+    blocks = cov.reshape(count, n, count, n, *batch)
+    across = row.reshape(n, count, n, *row.shape[2:])
+    (here_down, older_down), (here_across, older_across) = (
+        [x[:, None, None, None] for x in (here, older)],
+        [x[None, None, :, None] for x in (here, older)],
+    )
+    blocks = jnp.where(older_down, jnp.concatenate([blocks[:1], blocks[:-1]]), blocks)
+    blocks = jnp.where(
+        older_across, jnp.concatenate([blocks[:, :, :1], blocks[:, :, :-1]], 2), blocks
+    )
+    across = jnp.where(older_across[0], jnp.concatenate([across[:, :1], across[:, :-1]], 1), across)
+    across = jnp.where(here_across[0], own[:, None], across)
+    down = jnp.moveaxis(across, (0, 1, 2), (2, 0, 1))
+    blocks = jnp.where(here_across, down[:, :, None], blocks)
+    blocks = jnp.where(here_down, across[None], blocks)
+    return blocks.reshape(cov.shape[:2] + blocks.shape[4:])
+
+
+@kernel
+def _reduced(cov: Array, cross: Array, weights: Array) -> Array:
+    """P - P H' K' with K' = weights."""
+    return cov - total(w[:, None] * c[None] for w, c in zip(weights, cross, strict=True))
+
+
+@kernel
+def _joseph(half: Array, weights: Array, correction: Array) -> Array:
+    """half + K correction, made symmetric."""
+    whole = half + total(w[:, None] * c[None] for w, c in zip(weights, correction, strict=True))
+    return (whole + jnp.swapaxes(whole, 0, 1)) / 2

@@ -9,7 +9,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.estimator import choose, verdict
 from ewif_jax.forms.covariance import CovarianceState, covariance_form
-from ewif_jax.kernels import gaussian, retrodiction, symmetric
+from ewif_jax.kernels import gaussian, retrodiction, slots, symmetric
 from ewif_jax.kernels.small import fence, matmul, matvec
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -61,11 +61,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
         moved = form.predict(params, now, time)
         left = moved.time > state.time
         push = left & state.used
-        past = jax.tree.map(
-            lambda new, old: jnp.where(push, jnp.concatenate([new[None], old[:-1]]), old),
-            now,
-            state.past,
-        )
+        past = jax.tree.map(lambda new, old: slots.pushed(new, old, push), now, state.past)
         return HistoryState(moved.time, moved.mean, moved.cov, state.used & ~left, past)
 
     def update(
@@ -94,14 +90,10 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
 
 def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceState]:
     """Whether there is an entry not newer than `time`, and the newest such (else the oldest)."""
-    slots = past.time.shape[0]
+    count = past.time.shape[0]
     newer = jnp.sum(past.time > time)
-    here = jnp.arange(slots) == jnp.minimum(newer, slots - 1)
-
-    def pick(table: Array) -> Array:
-        return jnp.sum(jnp.where(here.reshape(-1, *[1] * (table.ndim - 1)), table, 0), 0)
-
-    return newer < slots, jax.tree.map(pick, past)
+    here = jnp.arange(count) == jnp.minimum(newer, count - 1)
+    return newer < count, jax.tree.map(lambda table: slots.picked(table, here), past)
 
 
 def late_update(

@@ -16,6 +16,8 @@ from ewif_jax.scenarios.arrowhead import (
 )
 from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
+from ewif_jax.scenarios.turn import turn, turn_model, turn_state
+from ewif_jax.scenarios.two_bearings import two_bearings, two_bearings_model, two_bearings_path
 
 __all__ = [
     "arbitrary_noise",
@@ -33,4 +35,10 @@ __all__ = [
     "sine",
     "sine_model",
     "sine_signal",
+    "turn",
+    "turn_model",
+    "turn_state",
+    "two_bearings",
+    "two_bearings_model",
+    "two_bearings_path",
 ]

@@ -1,7 +1,7 @@
 """The Rauch-Tung-Striebel smoother: every state given all the measurements."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,13 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.estimator import cast, float_dtype
-from ewif_jax.forms.covariance import measure
+from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.small import matmul, matvec
-from ewif_jax.models.model import Model, flow
+from ewif_jax.models.model import Model
 from ewif_jax.types import Gaussian, Measurement
+
+FORMS = ("extended", "unscented")
 
 
 class Moved(NamedTuple):
@@ -28,7 +30,16 @@ class Moved(NamedTuple):
 
 
 def rts(
-    model: Model, params: Any, measurements: Measurement, *, prior: Gaussian, t0: Any
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    *,
+    prior: Gaussian,
+    t0: Any,
+    form: Literal["extended", "unscented"] = "extended",
+    ut_alpha: Any = 1.0,
+    ut_beta: Any = 0.0,
+    ut_kappa: Any = 0.0,
 ) -> Gaussian:
     r"""The state at the time of each measurement, given all the measurements.
 
@@ -38,9 +49,12 @@ def rts(
         P_{k|T} &= (I - G_k F_k) P_{k|k} (I - G_k F_k)' + G_k (P_{k+1|T} + Q_k) G_k'
 
     Rauch, Tung & Striebel (1965); Pornsarayouth & Yamakita (91)-(94), backward through a forward
-    Kalman filter, with Jacobians at the filtered means where the model is not linear. The
-    covariance is written as a sum of positive semidefinite terms; it equals the usual
-    :math:`P_{k|k} + G_k (P_{k+1|T} - P_{k+1|k}) G_k'`. Singular Q and singular P are allowed.
+    filter. Where the model is not linear, F is its Jacobian at the filtered mean ("extended"), or
+    the slope that sigma points of the filtered estimate give it, with what that leaves over in Q
+    ("unscented"): then :math:`P_{k|k} F_k'` is the unscented cross-covariance, and this is the
+    smoother of Sarkka (2008). The covariance is written as a sum of positive semidefinite terms; it
+    equals the usual :math:`P_{k|k} + G_k (P_{k+1|T} - P_{k+1|k}) G_k'`. Singular Q and singular P
+    are allowed.
 
     Args:
         model: any `Model` with process noise defined for t1 >= t0.
@@ -49,16 +63,19 @@ def rts(
             just a time to report at.
         prior: Gaussian at t0.
         t0: its time in seconds, not later than any measurement.
+        form: "extended" or "unscented".
+        ut_alpha, ut_beta, ut_kappa: as in `unscented`, for that form.
 
     Returns:
         `Gaussian`: mean (T, n) and cov (T, n, n) at the measurement times, in the stream's order;
         NaN if a time inside a trace turns out to be earlier than t0.
 
     Raises:
-        ValueError: an unusable stream or prior, or a measurement earlier than t0.
+        ValueError: an unusable stream or prior, a measurement earlier than t0, an unknown form, or
+            settings that `unscented` refuses.
 
-    Reduces to: `kalman` (or `extended`) at the last time; the joint Gaussian posterior for linear
-        models.
+    Reduces to: `kalman` (or `extended`, `unscented`) at the last time; the joint Gaussian posterior
+        for linear models.
 
     Deviations: (94) prints the last factor transposed.
     """
@@ -74,23 +91,32 @@ def rts(
     if times is not None and start is not None:
         early = float(times.min())
         checks.require(early >= start, "measurements.time", f"times from t0 = {start} on", early)
+    checks.require(form in FORMS, "form", f"one of {FORMS}", repr(form))
+    points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if form == "unscented" else None
     prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
-    return _rts(model, params, measurements, prior, jnp.asarray(t0, dtype))
+    if points is not None:
+        transform(points, params, prior.mean.shape[0], dtype)
+    return _rts(model, points, params, measurements, prior, jnp.asarray(t0, dtype))
 
 
-@partial(jax.jit, static_argnames="model")
+@partial(jax.jit, static_argnames=("model", "points"))
 def _rts(
-    model: Model, params: Any, measurements: Measurement, prior: Gaussian, t0: Array
+    model: Model,
+    points: SigmaPoints | None,
+    params: Any,
+    measurements: Measurement,
+    prior: Gaussian,
+    t0: Array,
 ) -> Gaussian:
     order = jnp.argsort(measurements.time)
     in_time = jax.tree.map(lambda x: x[order], measurements)
 
     def ahead(state: tuple[Array, Array, Array], measurement: Measurement):
         time, left, left_cov = state
-        predicted, F, Q = flow(model, params, left, time, measurement.time)
+        predicted, F, Q = flow_around(model, points, params, left, left_cov, time, measurement.time)
         Q = symmetric.pack(Q)
         cov = symmetric.congruence(F, left_cov) + Q
-        mean, cov, _ = measure(model, params, predicted, cov, measurement)
+        mean, cov, _ = measure_around(model, points, params, predicted, cov, measurement)
         mean = jnp.where(measurement.time >= time, mean, jnp.nan)
         return (measurement.time, mean, cov), Moved(left, left_cov, F, Q, predicted)
 

@@ -38,4 +38,15 @@ STUDIES = (
         "tau, q and the cut-off by gradient through late measurements",
         "ewif_jax.study.tuning_under_delay",
     ),
+    Study(
+        "two-bearings",
+        "two rotating bearing sensors, one late: ensembles and particles",
+        "ewif_jax.study.two_bearings",
+    ),
+    Study("turn", "particle filters, a fast turn and a late sensor", "ewif_jax.study.turn"),
+    Study(
+        "divergence",
+        "data saturation, and what weighting does about it",
+        "ewif_jax.study.divergence",
+    ),
 )

@@ -12,13 +12,22 @@ import numpy as np
 
 import ewif_jax as ej
 from ewif_jax import Estimator, Gaussian, Measurement, Model, Status
+from ewif_jax.estimators.bootstrap import bootstrap
+from ewif_jax.estimators.ensemble import ensemble
+from ewif_jax.estimators.unscented import unscented
 from ewif_jax.oosm.a1 import a1
 from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.asd import asd
 from ewif_jax.oosm.b1 import b1
 from ewif_jax.oosm.bl1 import bl1
 from ewif_jax.oosm.drop_late import drop_late
+from ewif_jax.oosm.enkf1 import enkf1
+from ewif_jax.oosm.enkf2 import enkf2
+from ewif_jax.oosm.pf_extended import pf_extended
+from ewif_jax.oosm.pf_fixed_point import pf_fixed_point
+from ewif_jax.oosm.pf_retrodict import pf_retrodict
 from ewif_jax.oosm.replay import replay
+from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
 from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
 
@@ -94,6 +103,38 @@ ROWS = (
         predicts_back=True,
     ),
     Row("extended", ej.extended),
+    Row("unscented", unscented),
+    Row("ensemble", lambda model: ensemble(model, 20), needs_key=True),
+    Row(
+        "ensemble_square_root",
+        lambda model: ensemble(model, 20, "square_root"),
+        needs_key=True,
+        refuses="ensemble",
+    ),
+    Row(
+        "enkf1",
+        lambda model: enkf1(model, 20, LAG),
+        late=Status.LATE_USED,
+        needs_key=True,
+    ),
+    Row(
+        "enkf2",
+        lambda model: enkf2(model, 20, LAG),
+        late=Status.LATE_USED,
+        needs_key=True,
+    ),
+    Row(
+        "enkf2_shared",
+        lambda model: enkf2(model, 20, LAG, "shared"),
+        late=Status.LATE_USED,
+        needs_key=True,
+        refuses="enkf2",
+    ),
+    Row(
+        "rts_reference",
+        lambda model: rts_reference(model, LAG),
+        late=Status.LATE_USED,
+    ),
     Row("a1", a1, late=Status.LATE_USED),
     Row("b1", b1, late=Status.LATE_USED),
     Row("al1", lambda model: al1(model, LAG), late=Status.LATE_USED),
@@ -118,6 +159,33 @@ ROWS = (
         predicts_back=True,
     ),
     Row("fixed_lag", lambda model: fixed_lag(model, 2)),
+    Row("bootstrap", lambda model: bootstrap(model, 64), needs_key=True, differentiable=False),
+    Row(
+        "pf_retrodict",
+        lambda model: pf_retrodict(model, 64),
+        late=Status.LATE_USED,
+        any_age=True,
+        needs_key=True,
+        differentiable=False,
+    ),
+    Row(
+        "pf_extended",
+        lambda model: pf_extended(model, 64, LAG),
+        late=Status.LATE_USED,
+        needs_key=True,
+        differentiable=False,
+    ),
+    *(
+        Row(
+            f"pf_fixed_point_{smoother}",
+            lambda model, smoother=smoother: pf_fixed_point(model, 64, LAG, smoother),
+            late=Status.LATE_USED,
+            needs_key=True,
+            differentiable=False,
+            refuses="pf_fixed_point",
+        )
+        for smoother in ("eks", "uks", "ps")
+    ),
     Row(
         "fixed_lag_ewif",
         lambda model: fixed_lag_ewif(model, of("tau"), lag=0.5),

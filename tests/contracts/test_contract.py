@@ -97,7 +97,7 @@ def traced(row: Row, params: Any = PARAMS, value: Any = None, known: bool = True
 
 
 def avals(tree: Any) -> Any:
-    return jax.tree.map(lambda x: (jnp.shape(x), x.dtype, x.weak_type), tree)
+    return jax.tree.map(lambda x: (jnp.shape(x), x.dtype, getattr(x, "weak_type", False)), tree)
 
 
 def float_dtypes(tree: Any) -> set[Any]:

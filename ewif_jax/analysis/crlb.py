@@ -1,0 +1,83 @@
+"""What no unbiased estimator of a motion without noise can beat: the Cramer-Rao bound."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import cast, float_dtype
+from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.models import Model
+from ewif_jax.types import Measurement
+
+
+def crlb(
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    *,
+    state: Any,
+    time: Any,
+    weight: Callable[..., Array] | None = None,
+    information: Any = None,
+) -> Array:
+    r"""The bound (n, n) on the error covariance at `time`, when nothing but the start is unknown.
+
+    .. math::
+        \mathrm{CRLB}(t_k) = \Big( J_0 + \sum_l W_{l,k}^2
+            A_{l,k}' H_l' R_l^{-1} H_l A_{l,k} \Big)^{-1}
+
+    with :math:`H_l A_{l,k}` the derivative of measurement l with respect to the state at
+    :math:`t_k`. With `weight` it is the bound under the noise model (6) of Shulami & Sigalov, in
+    which the variance of an old measurement grows by :math:`1/W^2`: by their Theorem 6 it is the
+    covariance that `ewif` reports. Without, it is the bound for the true noise.
+
+    Args:
+        model: any `Model` that can be moved from `time` to each measurement; its process noise is
+            ignored.
+        params: what its parameters are read from.
+        measurements: T of them, of any times in any order; their values are not used.
+        state: (n,) true state at `time`, where a nonlinear model is linearised.
+        time: seconds.
+        weight: W(params, t_measurement, t_state), or None for 1.
+        information: (n, n) prior information matrix at `time`, or None for nothing.
+
+    Returns:
+        (n, n); NaN if the measurements do not determine the state.
+
+    Reduces to: the covariance of `kalman` without process noise; that of `ewif` with its weight.
+
+    Raises:
+        ValueError: unusable measurements, state or time.
+    """
+    checks.stream(measurements)
+    checks.finite("time", time)
+    dtype = float_dtype(state)
+    stream, time = cast(measurements, dtype), jnp.asarray(time, dtype)
+    state = jnp.asarray(state, dtype)
+    checks.shape("state", state, ("n",))
+    n = state.shape[0]
+    if information is not None:
+        checks.shape("information", information, (n, n))
+        checks.psd("information", information)
+
+    def one(measurement: Measurement) -> Array:
+        sensor, mask = measurement.sensor, measurement.mask
+
+        def seen(x: Array) -> Array:
+            there = model.transition(params, x, time, measurement.time)
+            return jnp.asarray(model.observe(params, there, sensor, measurement.time), dtype)
+
+        R = jnp.asarray(model.measurement_cov(params, sensor, measurement.time), dtype)
+        noise = cholesky.factor(gaussian.mask_cov(R, mask))
+        white = cholesky.forward(noise, jnp.where(mask[:, None], jax.jacfwd(seen)(state), 0))
+        w = 1.0 if weight is None else weight(params, measurement.time, time)
+        return jnp.square(w) * white.T @ white
+
+    total = jnp.sum(jax.vmap(one)(stream), 0)
+    total = total if information is None else total + jnp.asarray(information, dtype)
+    f = cholesky.factor(total)
+    return jnp.where(f.full_rank, cholesky.inverse(f), jnp.nan)

@@ -1,0 +1,82 @@
+"""The bootstrap particle filter."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax.forms import particles as form
+from ewif_jax.forms.particles import ParticleState
+from ewif_jax.kernels.resampling import Resampling
+from ewif_jax.models import Model
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+
+def bootstrap(
+    model: Model,
+    particles: int,
+    resampling: Resampling = "systematic",
+    ess_threshold: float = 0.5,
+) -> Estimator:
+    r"""The particle filter that moves particles by the model and weighs them by the measurement.
+
+    .. math::
+        x_k^i = f(x_{k-1}^i) + v^i, \quad v^i \sim N(0, Q), \qquad
+        w_k^i \propto w_{k-1}^i\, p(z_k | x_k^i), \qquad
+        \hat x = \sum_i w^i x^i, \quad P = \sum_i w^i (x^i - \hat x)(x^i - \hat x)'
+
+    sampling importance resampling (Gordon, Salmond & Smith 1993; (3)-(7) of Orguner & Gustafsson
+    with the motion as proposal; (87), (90)-(92) of Pornsarayouth & Yamakita in sequence). Weights
+    are logarithms throughout. The log likelihood of a measurement is the logarithm of the mean
+    density, so the sum over a stream is the logarithm of an unbiased estimate of the likelihood.
+
+    Args:
+        model: linear or not, with Gaussian noise. Q and the prior's covariance may be singular or
+            zero; R must be positive definite (else every measurement is `REJECTED`).
+        particles: N >= 2.
+        resampling: "systematic" (one random number) or "stratified" (one per particle).
+        ess_threshold: the filter resamples before it moves on when fewer than this share of the
+            particles count (effective sample size 1 / sum w^2). 0: never, 1: always but for equal
+            weights.
+
+    A late measurement is not used (`TOO_LATE`). One whose density is zero or not a number for every
+    particle is `REJECTED` and changes nothing; particles for which alone this holds get weight
+    zero. `init` needs a key, which travels in the state.
+
+    Gradients: particles are differentiated along their random numbers, and resampling keeps the
+    derivative of the weights (w / stop_gradient(w), Scibior & Wood 2021), so that the derivative
+    of the likelihood estimate (exp of the summed log likelihood) is unbiased, and that of the log
+    likelihood has a bias of order 1 / N. Its variance grows with the square of the number of steps
+    (ancestral lines merge); it is not the finite difference of a run with equal random numbers,
+    which jumps where a resampling changes. With ess_threshold=0 both are equal.
+
+    Reduces to: `kalman` on a linear model as N grows, with errors of order 1 / sqrt(N).
+
+    Raises:
+        ValueError: fewer than 2 particles; an unknown scheme; `init` without a key or a prior.
+
+    Deviations: resampling waits until the filter moves on, so that estimates do not carry its
+        noise.
+    """
+    kind = form.cloud(model, particles, resampling, ess_threshold)
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ParticleState:
+        del params
+        return form.draw(kind, "bootstrap", prior, t0, key)
+
+    def predict(params: Any, state: ParticleState, time: Array) -> ParticleState:
+        time = jnp.asarray(time, state.time.dtype)
+        return form.leave(state, time, lambda s: form.step_ahead(kind, params, s, time)[0])
+
+    def update(
+        params: Any, state: ParticleState, measurement: Measurement
+    ) -> tuple[ParticleState, Info]:
+        seen = form.look(model, params, state.particles, state.log_weights, measurement)
+        log_weights, info = form.weigh(state, seen, measurement, reachable=False)
+        return state._replace(log_weights=log_weights), info
+
+    def estimate(params: Any, state: ParticleState) -> Gaussian:
+        del params
+        return form.summary(state)
+
+    return Estimator(init, predict, update, estimate)

@@ -1,0 +1,93 @@
+"""The ensemble Kalman filter."""
+
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.forms import ensembles
+from ewif_jax.forms.ensembles import EnsembleState
+from ewif_jax.models import Model
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+FORMS = ("stochastic", "square_root")
+
+
+def ensemble(
+    model: Model, members: int, form: Literal["stochastic", "square_root"] = "stochastic"
+) -> Estimator:
+    r"""The Kalman filter whose moments are those of N members that move through the model.
+
+    .. math::
+        x_i^- = f(x_i) + v_i \quad (33), \qquad \hat x = \tfrac1N \textstyle\sum x_i, \quad
+        P = \tfrac1{N-1} \textstyle\sum (x_i - \hat x)(x_i - \hat x)' \quad (18), (19)
+
+    Pornsarayouth & Yamakita, with :math:`P_{xz}, P_{hh}` the sample covariances of the members with
+    :math:`h(x_i)`, :math:`P_{zz} = P_{hh} + R` and the gain :math:`K = P_{xz} P_{zz}^{-1}`.
+
+    * "stochastic": :math:`x_i \leftarrow x_i + K (z - h(x_i) - w_i)`, each member with its own
+      measurement noise (Burgers, van Leeuwen & Evensen 1998).
+    * "square_root": :math:`\hat x \leftarrow \hat x + K (z - \hat z)`, and the deviations by
+      :math:`e_i \leftarrow e_i - P_{xz} L'^{-1} (L + G)^{-1} (h(x_i) - \hat z)` with
+      :math:`P_{zz} = L L',\; R = G G'` (Andrews 1968; Whitaker & Hamill 2002), so that the sample
+      covariance is :math:`P - K P_{zz} K'` exactly; for one number it is the ensemble transform
+      filter. Only process noise is drawn.
+
+    Innovations go through `model.residual` for each member, means of angles relative to the
+    measurement predicted at the mean. Late measurements, masks and singular Q, P and R as in
+    `kalman`. The members are functions of `params` and of fixed random numbers, so gradients are
+    those of one realisation.
+
+    Args:
+        model: linear or not; no derivative of it is needed.
+        members: N >= 2; fewer than states, they stay in the space that they span.
+        form: which of the two.
+
+    The state holds the members (n, N) and two keys. Noise depends on the key, on the number of
+    moves and on the sensor, not on what was measured: see `fuse_ensembles`.
+
+    Reduces to: `kalman` on a linear model as N grows, at rate :math:`1/\sqrt N`.
+
+    Deviations: R takes the place of the sample covariance of w_i in (29), and each set of N draws
+        is moved to mean zero: both remove errors of order :math:`1/\sqrt N`.
+
+    Raises:
+        ValueError: members < 2; an unknown form; `init` with `prior=None` or without a key.
+    """
+    checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
+    count = checks.whole("members", members, 2)
+    checks.require(form in FORMS, "form", f"one of {FORMS}", repr(form))
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> EnsembleState:
+        del params
+        return ensembles.start(prior, t0, key, count, "ensemble")
+
+    def predict(params: Any, state: EnsembleState, time: Array) -> EnsembleState:
+        time = jnp.asarray(time, state.time.dtype)
+        ahead = jnp.maximum(time, state.time)
+        moved, _ = ensembles.moved(model, params, state, ahead)
+        shown = jnp.where(time >= state.time, moved.members, jnp.nan)
+        return moved._replace(time=time, members=shown)
+
+    def update(
+        params: Any, state: EnsembleState, measurement: Measurement
+    ) -> tuple[EnsembleState, Info]:
+        late, present = measurement.time < state.time, jnp.any(measurement.mask)
+        used = present & ~late
+        own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
+        looked = ensembles.look(model, params, state.members, state.members, measurement)
+        if form == "stochastic":
+            updated = ensembles.perturbed(model, state.members, looked, measurement, own)
+        else:
+            updated = ensembles.transformed(state.members, looked)
+        delay = state.time - measurement.time
+        info = ensembles.info_of(looked, measurement.mask, delay, used, verdict(late, present))
+        return choose(used, state._replace(members=updated, sight=sight), state), info
+
+    def estimate(params: Any, state: EnsembleState) -> Gaussian:
+        del params
+        return ensembles.moments(state.members)
+
+    return Estimator(init, predict, update, estimate)

@@ -1,0 +1,85 @@
+"""The unscented Kalman filter."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.forms.covariance import CovarianceState, covariance_form
+from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around, transform
+from ewif_jax.kernels import symmetric
+from ewif_jax.models import Model
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+
+def unscented(
+    model: Model, ut_alpha: Any = 1.0, ut_beta: Any = 0.0, ut_kappa: Any = 0.0
+) -> Estimator:
+    r"""The Kalman filter whose moments come from 2n + 1 points of the model, not from Jacobians.
+
+    With :math:`P = L L'`, :math:`c = \alpha^2 (n + \kappa)`, points
+    :math:`x_0 = \hat x,\; x_{\pm j} = \hat x \pm \sqrt c\, L_j` and values :math:`y = f(x)`,
+
+    .. math::
+        \hat y &= y_0 + \tfrac{1}{2c} \textstyle\sum_j (y_j - y_0), \qquad
+        P_{xy} = \tfrac{1}{2c} \textstyle\sum_j (x_j - \hat x)(y_j - \hat y)' \\
+        P_{yy} &= \tfrac{1}{2c} \textstyle\sum_j (y_j - \hat y)(y_j - \hat y)'
+            + (2 - n/c - \alpha^2 + \beta)(y_0 - \hat y)(y_0 - \hat y)'
+
+    to which Q or R is added (Julier & Uhlmann 2004; van der Merwe 2004): noise is additive. New
+    points are drawn for every prediction and for every measurement. Measurements are compared with
+    the one predicted at the mean through `model.residual`, so bearings around :math:`\pm\pi` have
+    the right mean. Late measurements, masks and singular matrices as in `kalman`.
+
+    Args:
+        model: linear or not; no derivative of it is needed.
+        ut_alpha: spread of the points, > 0, a number or a function of `params`.
+        ut_beta: weight for what is known about the distribution; 2 is best for a scalar Gaussian.
+        ut_kappa: second spread, > -n.
+
+    The default, :math:`\alpha = 1, \beta = \kappa = 0`, is the cubature filter (Arasaratnam &
+    Haykin 2009): all weights are positive, so the covariances are positive semidefinite, as they
+    are for every setting with :math:`2 - n/c - \alpha^2 + \beta \ge 0`.
+
+    Reduces to: `kalman` on a linear model.
+
+    Raises:
+        ValueError: `init` with `prior=None`; ut_alpha <= 0; ut_kappa <= -n; points so close
+            together that the dtype cannot tell their values apart (ut_alpha = 1e-3 in float32).
+    """
+    checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
+    points = SigmaPoints(ut_alpha, ut_beta, ut_kappa)
+    form = covariance_form(model, "unscented")
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
+        state = form.init(params, prior, t0, key)
+        transform(points, params, state.mean.shape[0], state.mean.dtype)
+        return state
+
+    def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+        time = jnp.asarray(time, state.time.dtype)
+        ahead = jnp.maximum(time, state.time)
+        mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, ahead)
+        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
+        moved = choose(time > state.time, CovarianceState(time, mean, cov), state)
+        known = time >= state.time
+        return CovarianceState(
+            time, jnp.where(known, moved.mean, jnp.nan), jnp.where(known, moved.cov, jnp.nan)
+        )
+
+    def update(
+        params: Any, state: CovarianceState, measurement: Measurement
+    ) -> tuple[CovarianceState, Info]:
+        late, present = measurement.time < state.time, jnp.any(measurement.mask)
+        used = present & ~late
+        mean, cov, info = measure_around(model, points, params, state.mean, state.cov, measurement)
+        info = info._replace(
+            log_likelihood=jnp.where(used, info.log_likelihood, 0),
+            delay=state.time - measurement.time,
+            status=verdict(late, present),
+        )
+        return choose(used, CovarianceState(state.time, mean, cov), state), info
+
+    return form._replace(init=init, predict=predict, update=update)

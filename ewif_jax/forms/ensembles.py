@@ -1,0 +1,221 @@
+"""Ensembles: members that stand for a distribution, moved and updated one by one."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose
+from ewif_jax.forms.sigma_points import view
+from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.models.model import Model
+from ewif_jax.types import Gaussian, Info, Measurement
+
+
+class EnsembleState(NamedTuple):
+    """time (), members (n, N), key: of the process noise to come, sight: key of the measurement
+    noise at this time."""
+
+    time: Array
+    members: Array
+    key: Array
+    sight: Array
+
+
+class Look(NamedTuple):
+    """What an ensemble makes of a measurement: seen (m, N), what its members predict, deviations
+    (m, N) from their mean, the noise root G (m, m) with R = G G', and the innovation."""
+
+    seen: Array
+    deviations: Array
+    noise: Array
+    innovation: gaussian.Innovation
+
+
+def start(prior: Gaussian | None, t0: Any, key: Any, count: int, method: str) -> EnsembleState:
+    """`count` members drawn from the prior."""
+    prior = checks.needs_prior(prior, method)
+    checks.prior(prior)
+    own, path, sight = jax.random.split(checks.needs_key(key, method), 3)
+    mean = jnp.asarray(prior.mean)
+    root = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
+    members = mean[:, None] + noise(own, root, count)
+    return EnsembleState(jnp.asarray(t0, mean.dtype), members, path, sight)
+
+
+def noise(key: Array, root: Array, count: int) -> Array:
+    """`count` draws (n, count) with covariance root root', moved so that their mean is zero.
+
+    Drawn in float32 whatever the dtype, so that single and double precision see the same noise.
+    """
+    drawn = jax.random.normal(key, (root.shape[1], count), jnp.float32).astype(root.dtype)
+    return matmul(root, drawn - jnp.mean(drawn, 1, keepdims=True))
+
+
+def process_noise(
+    model: Model, params: Any, key: Array, members: Array, t0: Array, t1: Array
+) -> Array:
+    """Draws (n, N) of the process noise of an interval, one for each member."""
+    Q = jnp.asarray(model.process_cov(params, t0, t1), members.dtype)
+    checks.shape("Q", Q, (members.shape[0],) * 2)
+    return noise(key, cholesky.factor(Q).lower, members.shape[1])
+
+
+def carried(model: Model, params: Any, members: Array, t0: Array, t1: Array) -> Array:
+    """The members (n, N) at t1, without process noise."""
+
+    def move(x: Array) -> Array:
+        return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
+
+    return jax.vmap(move, in_axes=1, out_axes=1)(members)
+
+
+def moved(
+    model: Model, params: Any, state: EnsembleState, time: Array
+) -> tuple[EnsembleState, Array]:
+    """The state at a time not before its own, and the process noise (n, N) it met.
+
+    Keys are used up by moving only, never by what is measured in between: filters that start from
+    one key and move at the same times meet the same noise.
+    """
+    key, motion, sight = jax.random.split(state.key, 3)
+    met = process_noise(model, params, motion, state.members, state.time, time)
+    members = carried(model, params, state.members, state.time, time) + met
+    return choose(time > state.time, EnsembleState(time, members, key, sight), state), met
+
+
+def sight_keys(sight: Array, sensor: Array) -> tuple[Array, Array]:
+    """The key of a measurement of this sensor, and the one for the next measurement. Sensors get
+    different noise also in filters that share everything else."""
+    return jax.random.fold_in(sight, sensor + 1), jax.random.fold_in(sight, 0)
+
+
+def back_key(sight: Array) -> Array:
+    """The key of process noise that is drawn to look back; no sensor has this number."""
+    return jax.random.fold_in(sight, 2**32 - 1)
+
+
+def look(model: Model, params: Any, members: Array, there: Array, measurement: Measurement) -> Look:
+    """The measurement as predicted by the members `there` (n, N) at its time; `innovation.cross`
+    relates it to `members`."""
+    sensor, mask = measurement.sensor, measurement.mask
+    middle = jnp.mean(there, 1)
+    see, R = view(model, params, sensor, measurement.time, middle)
+    origin = see(middle)
+    checks.shape("measurement.value", measurement.value, origin.shape)
+    checks.shape("R", R, origin.shape * 2)
+    seen = jax.vmap(see, in_axes=1, out_axes=1)(there)
+
+    def offset(value: Array) -> Array:
+        return model.residual(value, origin, sensor)
+
+    offsets = jax.vmap(offset, in_axes=1, out_axes=1)(seen)
+    shift = jnp.mean(offsets, 1)
+    deviations = jnp.where(mask[:, None], offsets - shift[:, None], 0)
+    difference = model.residual(measurement.value, origin + shift, sensor)
+    cross = covariance(deviations, members)
+    innovation = gaussian.innovate(difference, cross, spread(deviations) + R, mask)
+    root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
+    return Look(seen, deviations, root, innovation)
+
+
+def perturbed(
+    model: Model, members: Array, looked: Look, measurement: Measurement, key: Array
+) -> Array:
+    """Each member moved by the gain times its own innovation z - (z_i + w_i)."""
+
+    def innovation(expected: Array) -> Array:
+        return model.residual(measurement.value, expected, measurement.sensor)
+
+    drawn = noise(key, looked.noise, members.shape[1])
+    own = jax.vmap(innovation, in_axes=1, out_axes=1)(looked.seen + drawn)
+    own = jnp.where(measurement.mask[:, None], own, 0)
+    return members + matmul(gaussian.gain(looked.innovation), own)
+
+
+def transformed(members: Array, looked: Look) -> Array:
+    r"""The mean moved by the gain times the innovation, the deviations by
+    :math:`\bar K = P_{xz} L'^{-1} (L + G)^{-1}` with :math:`P_{zz} = L L',\; R = G G'`."""
+    innovation = looked.innovation
+    lower = innovation.factor.lower + looked.noise
+    diagonal = jnp.diag(lower)
+    kept = diagonal > 0
+    reciprocal = jnp.where(kept, 1 / jnp.where(kept, diagonal, 1), 0)
+    both = cholesky.Factor(lower, reciprocal, jnp.all(kept))
+    white = cholesky.forward(innovation.factor, innovation.cross)
+    gain = cholesky.backward(both, white).T
+    step = matvec(gaussian.gain(innovation), innovation.value)
+    return members + step[:, None] - matmul(gain, looked.deviations)
+
+
+def info_of(looked: Look, mask: Array, delay: Array, used: Array, status: Array) -> Info:
+    """Diagnostics of an update with this look."""
+    density = gaussian.log_density(looked.innovation, mask)
+    value, cov = looked.innovation.value, looked.innovation.cov
+    return Info(value, cov, jnp.where(used, density, 0), delay, status)
+
+
+def covariance(a: Array, b: Array) -> Array:
+    """The sample covariance (p, q) of a (p, N) with b (q, N), where a has mean zero."""
+    centred = b - jnp.mean(b, 1, keepdims=True)
+    return jnp.matmul(a, centred.T, precision=jax.lax.Precision.HIGHEST) / (a.shape[1] - 1)
+
+
+def spread(deviations: Array) -> Array:
+    """The sample covariance (p, p) of deviations (p, N) from a mean, symmetric to the last bit."""
+    return symmetric.unpack(symmetric.pack(covariance(deviations, deviations)))
+
+
+def moments(members: Array) -> Gaussian:
+    """Sample mean (n,) and covariance (n, n) of members (n, N)."""
+    mean = jnp.mean(members, 1)
+    return Gaussian(mean, spread(members - mean[:, None]))
+
+
+def fuse_ensembles(ensembles: Any) -> Array:
+    r"""One ensemble of several that estimate the same state at the same time.
+
+    .. math::
+        x_i^{12} = x_i^1 + P_{x^1\delta} P_{\delta\delta}^{-1} (x_i^2 - x_i^1), \quad
+        \delta = e^1 - e^2 \quad (34)-(38)
+
+    Pornsarayouth & Yamakita, applied to pairs, pairs of pairs and so on. The cross-covariance of
+    the estimates is read off the members, so these have to share their random numbers: run the
+    filters (`ensemble`, `enkf1`, `enkf2`) from the same key, moving at the same times. Measurement
+    noise is then drawn apart for each sensor, prior and process noise together.
+
+    Args:
+        ensembles: at least one array (n, N): the field `members` of each state.
+
+    Returns:
+        The fused members (n, N).
+
+    Reduces to: the ensemble itself where all are equal; for linear models and many members the
+        best linear combination of correlated estimates (Bar-Shalom & Campo 1986), two at a time.
+
+    Raises:
+        ValueError: no ensemble, or ensembles of different shapes.
+    """
+    level = [jnp.asarray(x) for x in ensembles]
+    checks.require(len(level) > 0, "ensembles", "at least one ensemble", "none")
+    for k, x in enumerate(level):
+        checks.shape(f"ensembles[{k}]", x, ("n", "N"))
+        checks.shape(f"ensembles[{k}]", x, level[0].shape)
+    while len(level) > 1:
+        pairs = [_fused(a, b) for a, b in zip(level[::2], level[1::2], strict=False)]
+        level = pairs + level[2 * len(pairs) :]
+    return level[0]
+
+
+def uncorrelated(members: Array, d: Array) -> Array:
+    """The members (n, N) less their regression on d (n, N): x_i - P_xd P_dd^-1 d_i."""
+    deviations = d - jnp.mean(d, 1, keepdims=True)
+    weights = cholesky.solved(spread(deviations), covariance(deviations, members))
+    return members - matmul(weights.T, d)
+
+
+def _fused(first: Array, second: Array) -> Array:
+    return uncorrelated(first, first - second)

@@ -1,0 +1,101 @@
+"""Fixed-point smoothing: what the state now says of the state at an earlier time."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax.estimator import choose
+from ewif_jax.forms.covariance import CovarianceState
+from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around
+from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.models import Model
+from ewif_jax.types import Gaussian, Measurement
+
+
+class Conditional(NamedTuple):
+    """The density of x(tau) given x(now): N(mean + gain (x(now) - now), cov), with mean and now
+    (n,), gain and cov (n, n)."""
+
+    mean: Array
+    gain: Array
+    now: Array
+    cov: Array
+
+
+def fixed_point(
+    model: Model,
+    points: SigmaPoints | None,
+    params: Any,
+    start: CovarianceState,
+    tau: Array,
+    measurements: Measurement,
+    now: Array,
+) -> Conditional:
+    r"""The density of x(tau) given any x(now) and all measurements older than `now`.
+
+    .. math::
+        p(x_\tau | x_k, y_{0:k-1}) = N(\hat x_\tau + G (x_k - \hat x_k),\;
+            P_{\tau\tau} - G P_{k\tau}), \quad G = P_{\tau k} P_{kk}^{-1}
+
+    (43)-(46) of Orguner & Gustafsson: the filter of the augmented state (36)-(38) from `start`, the
+    last summary not newer than tau, through the measurements after tau, and on to `now`; there x_k
+    is a measurement, through (24), of the state at the last of these times (tau itself if nothing
+    was measured since). One gain serves every x_k. Exact for a linear model.
+
+    Args:
+        points: of the unscented transform (UKS), or None: linearised (EKS).
+        start: time (), mean (n,), cov (packed).
+        measurements: (L,) in order of time; those not inside (tau, now) are passed over.
+
+    Deviations: Remark 2 prints x(k-1) for x(tau) in (44), which is not the posterior.
+    """
+    n = start.mean.shape[0]
+    both = _augmented(model, n)
+
+    def ahead(model: Model, state: CovarianceState, time: Array) -> CovarianceState:
+        mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, time)
+        return CovarianceState(time, mean, symmetric.congruence(F, state.cov) + symmetric.pack(Q))
+
+    def one(state: CovarianceState, measurement: Measurement) -> tuple[CovarianceState, None]:
+        inside = (measurement.time > tau) & (measurement.time < now)
+        inside = inside & jnp.any(measurement.mask)
+        moved = ahead(both, state, jnp.where(inside, measurement.time, state.time))
+        mean, cov, _ = measure_around(both, points, params, moved.mean, moved.cov, measurement)
+        return choose(inside, CovarianceState(moved.time, mean, cov), state), None
+
+    there = ahead(model, start, tau)
+    twice = jnp.tile(symmetric.unpack(there.cov), (2, 2))
+    first = CovarianceState(tau, jnp.tile(there.mean, 2), symmetric.pack(twice))
+    last = ahead(both, lax.scan(one, first, measurements)[0], now)
+    cov = symmetric.unpack(last.cov)
+    f = cholesky.factor(cov[:n, :n])
+    root = cholesky.forward(f, cov[:n, n:])
+    gain = cholesky.backward(f, root).T
+    return Conditional(last.mean[n:], gain, last.mean[:n], cov[n:, n:] - matmul(root.T, root))
+
+
+def given(conditional: Conditional, x: Array) -> Gaussian:
+    """The mean (n,) and covariance (n, n) of x(tau) if the state now is x (n,)."""
+    mean, gain, now, cov = conditional
+    return Gaussian(mean + matvec(gain, x - now), cov)
+
+
+def _augmented(model: Model, n: int) -> Model:
+    """The model of a state (2n,) whose second half stands still and is never seen (36), (37)."""
+
+    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
+        moved = jnp.asarray(model.transition(params, x[:n], t0, t1), x.dtype)
+        return jnp.concatenate([moved, x[n:]])
+
+    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+        Q = jnp.asarray(model.process_cov(params, t0, t1))
+        return jnp.zeros((2 * n, 2 * n), Q.dtype).at[:n, :n].set(Q)
+
+    def observe(params: Any, x: Array, sensor: Array, t: Array) -> Array:
+        return model.observe(params, x[:n], sensor, t)
+
+    return model._replace(
+        transition=transition, process_cov=process_cov, observe=observe, linear=None
+    )

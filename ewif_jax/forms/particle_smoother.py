@@ -1,0 +1,114 @@
+"""A small particle smoother: the state at a late time given any of many states now."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax.forms import particles as form
+from ewif_jax.forms.covariance import CovarianceState
+from ewif_jax.forms.particles import Seen
+from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.kernels.small import matmul
+from ewif_jax.models import Model
+from ewif_jax.types import Measurement
+
+BLOCK = 256
+"""How many particles are compared with all smoother particles at a time."""
+
+
+class Lines(NamedTuple):
+    """M particles that keep their past: time (), particles (n, M) at it, fixed (n, M): where each
+    came from at the fixed point, log_weights (M,), key."""
+
+    time: Array
+    particles: Array
+    fixed: Array
+    log_weights: Array
+    key: Array
+
+
+def lines(
+    model: Model,
+    params: Any,
+    start: CovarianceState,
+    tau: Array,
+    measurements: Measurement,
+    now: Array,
+    count: int,
+    key: Array,
+) -> Lines:
+    """Algorithm 1 of Orguner & Gustafsson up to the last measurement inside (tau, now).
+
+    `count` particles are drawn from `start`, moved to tau and kept there, moved on through the
+    measurements ((L,) in order of time), weighed by each and resampled with what they keep.
+
+    Deviations: the printed recursion does not say that particles are weighed by y(m).
+    """
+    key, first, second = jax.random.split(key, 3)
+    drawn = start.mean[:, None] + form.noise(first, symmetric.unpack(start.cov), count)
+    _, there = form.moved(model, params, drawn, second, start.time, tau)
+    log_weights = jnp.full(count, -jnp.log(jnp.asarray(count, there.dtype)), there.dtype)
+
+    def follow(state: Lines, measurement: Measurement) -> Lines:
+        key, first, second = jax.random.split(state.key, 3)
+        _, ahead = form.moved(model, params, state.particles, first, state.time, measurement.time)
+        seen = form.look(model, params, ahead, state.log_weights, measurement)
+        moved = Lines(measurement.time, ahead, state.fixed, state.log_weights, key)
+        log_weights, _ = form.weigh(moved, seen, measurement, reachable=True)
+        (ahead, fixed), log_weights = form.refreshed(
+            second, (ahead, state.fixed), log_weights, count / 2
+        )
+        return Lines(measurement.time, ahead, fixed, log_weights, key)
+
+    def one(state: Lines, measurement: Measurement) -> tuple[Lines, None]:
+        inside = (measurement.time > tau) & (measurement.time < now)
+        inside = inside & jnp.any(measurement.mask)
+        safe = measurement._replace(time=jnp.where(inside, measurement.time, state.time))
+        return lax.cond(inside, follow, lambda state, _: state, state, safe), None
+
+    state = Lines(tau, there, there, log_weights, key)
+    return lax.scan(one, state, measurements)[0]
+
+
+def look_back(
+    model: Model, params: Any, last: Lines, now: Array, state: Any, measurement: Measurement
+) -> Seen:
+    r"""A late measurement as it is seen by particles now (n, N), through the lines.
+
+    .. math::
+        p(y_\tau | x_k^i) = \sum_j \mu^{ij} p(y_\tau | \xi_\tau^j), \quad
+        \mu^{ij} \propto \mu^j N(x_k^i; f_{k,r}(\xi_r^j), Q_{k,r}) \quad (30), (47)-(49)
+
+    with r the last time before k of the lines: N M densities, in blocks of `BLOCK` rows that are
+    normalised by their largest term (most underflow otherwise). Where the best lines of a particle
+    leave nothing of p(y | xi), the particle gets weight zero. A singular Q has no density: then
+    nothing is a number.
+    """
+    ahead = form.transported(model, params, last.particles, last.time, now)
+    f = cholesky.factor(jnp.asarray(model.process_cov(params, last.time, now), ahead.dtype))
+    seen = form.look(model, params, last.fixed, last.log_weights, measurement)
+    center = jnp.mean(ahead, 1, keepdims=True)
+    targets, points = (cholesky.forward(f, x - center) for x in (ahead, state.particles))
+    best = jnp.max(seen.log_density)
+    best = jnp.where(best > -jnp.inf, best, 0)
+    density = jnp.exp(seen.log_density - best)
+    difference, R, _ = form.compared(model, params, last.fixed, measurement)
+    m = difference.shape[0]
+    squares = (difference[:, None] * difference[None]).reshape(m * m, -1)
+    columns = jnp.stack([jnp.ones_like(density), density, *difference, *squares], 1)
+
+    def means(x: Array) -> Array:
+        """Means of the columns over the lines, weighted by how well they lead to x (n,)."""
+        log_weights = last.log_weights - 0.5 * jnp.sum(jnp.square(targets - x[:, None]), 0)
+        sums = jnp.exp(log_weights - jnp.max(log_weights)) @ columns
+        return sums / sums[0]
+
+    found = lax.map(means, points.T, batch_size=BLOCK).T
+    possible = f.full_rank & (found[1] > 0)
+    log_density = jnp.where(possible, jnp.log(jnp.where(possible, found[1], 1)) + best, -jnp.inf)
+    w = jnp.exp(state.log_weights)[:, None]
+    innovation, square = (matmul(x, w)[:, 0] for x in (found[2 : 2 + m], found[2 + m :]))
+    outer = innovation[:, None] * innovation[None]
+    return Seen(log_density, innovation, R + square.reshape(m, m) - outer)

@@ -1,0 +1,38 @@
+"""Tables of the last few entries, newest first, that stay fast under `vmap`: a batched index or
+concatenation would be done one element at a time."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax.kernels.batched import kernel, total
+
+
+def pushed(new: Array, table: Array, push: Array) -> Array:
+    """The table (L, ...) with `new` (...) in front and the last entry gone, where `push` ()."""
+    return _pushed(new, table, push)
+
+
+def picked(table: Array, here: Array) -> Array:
+    """The entry (...) of the table (L, ...) where `here` (L,) is True; zeros if nowhere."""
+    return _picked(table, here)
+
+
+@kernel
+def _pushed(new: Array, table: Array, push: Array) -> Array:
+    batch = jnp.broadcast_shapes(*(x.shape[x.ndim - push.ndim :] for x in (new, table, push)))
+    new, table = (jnp.broadcast_to(x, x.shape[: x.ndim - push.ndim] + batch) for x in (new, table))
+    moved = jnp.concatenate([new[None], table[:-1]])
+    return jnp.where(_like(push, table.ndim), moved, table)
+
+
+@kernel
+def _picked(table: Array, here: Array) -> Array:
+    return total(
+        jnp.where(_like(chosen, entry.ndim), entry, 0)
+        for chosen, entry in zip(here, table, strict=True)
+    )
+
+
+def _like(x: Array, rank: int) -> Array:
+    """`x` with leading axes of length 1."""
+    return x.reshape((1,) * (rank - x.ndim) + x.shape)

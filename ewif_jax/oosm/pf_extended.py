@@ -1,0 +1,137 @@
+"""Particles that remember their paths, so that a late state is drawn between two known ones."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.forms import particles as form
+from ewif_jax.kernels import cholesky, retrodiction
+from ewif_jax.kernels.resampling import Resampling
+from ewif_jax.kernels.small import matvec
+from ewif_jax.models import Model, flow
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+
+class PathState(NamedTuple):
+    """time (), particles (n, N), log_weights (N,), key; used (): whether this time has taken a
+    measurement; past_times (L,) and past (L, n, N): where each particle was at the last L times,
+    newest first."""
+
+    time: Array
+    particles: Array
+    log_weights: Array
+    key: Array
+    used: Array
+    past_times: Array
+    past: Array
+
+
+def pf_extended(
+    model: Model,
+    particles: int,
+    lag: int,
+    resampling: Resampling = "systematic",
+    ess_threshold: float = 0.5,
+    collapse: float | None = 100.0,
+) -> Estimator:
+    r"""The bootstrap filter that draws the state at a late time from each particle's own path.
+
+    With a and c the stored times on either side of :math:`\tau` (c may be now),
+
+    .. math::
+        w^i &\propto w^i\, p(y_\tau | x_\tau^i), \qquad
+            x_\tau^i \sim N(\hat x_\tau^i, \Sigma_\tau^i) \quad (9), (13) \\
+        \hat x_\tau^i &= f_{\tau,a}(x_a^i)
+            + K (x_c^i - f_{c,\tau}(f_{\tau,a}(x_a^i))) \quad (14) \\
+        \Sigma_\tau^i &= Q_{\tau,a} - K F_{c,\tau} Q_{\tau,a}, \qquad
+            K = Q_{\tau,a} F_{c,\tau}' (F_{c,\tau} Q_{\tau,a} F_{c,\tau}' + Q_{c,\tau})^{-1}
+            \quad (15), (16)
+
+    with F the Jacobian at each particle: Orguner & Gustafsson (8)-(17), which extends Orton & Marrs
+    (2005) to nonlinear motion.
+
+    Args:
+        model: linear or not; its process noise must compose over parts of an interval. Q may be
+            singular; R must be positive definite.
+        particles: N >= 2.
+        lag: how many past times are stored, >= 1; each takes n N numbers. A measurement older than
+            all of them, or than t0, is `TOO_LATE`. Times without a used measurement are not stored.
+        resampling, ess_threshold: as in `bootstrap`. The paths are resampled with the particles.
+        collapse: as in `pf_retrodict`.
+
+    As N grows it converges to the posterior of a linear model, and of a nonlinear one as far as
+    (14)-(17) hold. A state drawn at a late time is not remembered: two late measurements between
+    the same stored times are taken as if their states were independent given those.
+
+    Gradients as in `bootstrap`.
+
+    Reduces to: `bootstrap` in sequence and at delay 0.
+
+    Raises:
+        ValueError: fewer than 2 particles; lag < 1; collapse < 1; `init` without a key or a prior.
+    """
+    kind = form.cloud(model, particles, resampling, ess_threshold)
+    collapse = form.collapse_factor(collapse)
+    lag = checks.whole("lag", lag, 1)
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> PathState:
+        del params
+        first = form.draw(kind, "pf_extended", prior, t0, key)
+        past = jnp.stack([first.particles] * lag)
+        return PathState(*first, jnp.asarray(False), jnp.stack([first.time] * lag), past)
+
+    def predict(params: Any, state: PathState, time: Array) -> PathState:
+        time = jnp.asarray(time, state.time.dtype)
+
+        def go(state: PathState) -> PathState:
+            paths = jnp.concatenate([state.particles[None], state.past])
+            left = state.time
+            state, paths = form.step_ahead(kind, params, state, time, paths)
+            times = jnp.concatenate([left[None], state.past_times])
+            kept = (times[:-1], paths[:-1]), (times[1:], paths[1:])
+            times, past = jax.tree.map(lambda a, b: jnp.where(state.used, a, b), *kept)
+            return state._replace(used=jnp.asarray(False), past_times=times, past=past)
+
+        return form.leave(state, time, go)
+
+    def update(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
+        def between(state: PathState) -> tuple[Array, Array]:
+            key, ours = jax.random.split(state.key)
+            return _between(model, params, state, measurement.time, ours), key
+
+        late = measurement.time < state.time
+        known = measurement.time >= state.past_times[-1]
+        there, key = lax.cond(late & known, between, lambda s: (s.particles, s.key), state)
+        seen = form.look(model, params, there, state.log_weights, measurement)
+        log_weights, info = form.weigh(state, seen, measurement, known, collapse)
+        used = state.used | form.was_used(info)
+        return state._replace(log_weights=log_weights, key=key, used=used), info
+
+    def estimate(params: Any, state: PathState) -> Gaussian:
+        del params
+        return form.summary(state)
+
+    return Estimator(init, predict, update, estimate)
+
+
+def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:
+    """Draws of the states at `time` (n, N), given where each particle was before and after."""
+    times = jnp.concatenate([state.time[None], state.past_times])
+    newer = jnp.clip(jnp.sum(times > time), 1, state.past_times.shape[0])
+    start, end = times[newer], times[newer - 1]
+    before = state.past[newer - 1]
+    after = jnp.where(newer == 1, state.particles, state.past[jnp.maximum(newer - 2, 0)])
+    time = jnp.clip(time, start, end)
+
+    def draw(x: Array, target: Array, normals: Array) -> Array:
+        there, _, Q_before = flow(model, params, x, start, time)
+        arrived, F, Q_after = flow(model, params, there, time, end)
+        gain, left_over = retrodiction.bridge(Q_before, F, Q_after)
+        root = cholesky.factor(left_over).lower
+        return there + matvec(gain, target - arrived) + matvec(root, normals)
+
+    normals = jax.random.normal(key, state.particles.shape, state.particles.dtype)
+    return jax.vmap(draw, -1, -1)(before, after, normals)

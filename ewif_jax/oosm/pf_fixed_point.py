@@ -1,0 +1,204 @@
+"""A particle filter that needs no old particles: auxiliary fixed-point smoothers."""
+
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.forms import particles as form
+from ewif_jax.forms.covariance import CovarianceState
+from ewif_jax.forms.fixed_point import Conditional, fixed_point, given
+from ewif_jax.forms.particle_smoother import lines, look_back
+from ewif_jax.forms.particles import Seen
+from ewif_jax.forms.sigma_points import SigmaPoints, transform
+from ewif_jax.kernels import gaussian, symmetric
+from ewif_jax.kernels.resampling import Resampling
+from ewif_jax.kernels.small import matmul
+from ewif_jax.models import Model, sight
+from ewif_jax.oosm.history import last_before
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+Smoother = Literal["eks", "uks", "ps"]
+
+
+class SummaryState(NamedTuple):
+    """time (), particles (n, N), log_weights (N,), key; past: time (L+1,), mean (L+1, n), cov
+    (L+1, packed) after each of the last updates, newest first, and measured: what was measured
+    then."""
+
+    time: Array
+    particles: Array
+    log_weights: Array
+    key: Array
+    past: CovarianceState
+    measured: Measurement
+
+
+def pf_fixed_point(
+    model: Model,
+    particles: int,
+    lag: int,
+    smoother: Smoother = "eks",
+    smoother_particles: int | None = None,
+    resampling: Resampling = "systematic",
+    ess_threshold: float = 0.5,
+    collapse: float | None = 100.0,
+    ut_alpha: Any = 1.0,
+    ut_beta: Any = 0.0,
+    ut_kappa: Any = 0.0,
+) -> Estimator:
+    r"""The bootstrap filter that smooths back to a late measurement from means and covariances.
+
+    .. math::
+        w^i \propto w^i\, p(y_\tau | x_k^i, y_{0:k}) \quad (21), \qquad
+        p(y_\tau | x_k^i, y_{0:k}) = \int p(y_\tau | x_\tau)\, p(x_\tau | x_k^i, y_{0:k-1})\,
+            dx_\tau \quad (23)
+
+    Orguner & Gustafsson (18)-(49). The smoothed density is a Gaussian with (27)-(29) for the
+    integral, by linearisation ("eks") or by sigma points ("uks"), see `forms.fixed_point`; or it is
+    `smoother_particles` weighted points ("ps"), see `forms.particle_smoother`. One smoother runs
+    for all particles; each then costs one product ("eks", "uks") or one row of densities ("ps").
+
+    Args:
+        model: linear or not; its process noise must compose over parts of an interval. R must be
+            positive definite, and for "ps" Q too.
+        particles: N >= 2.
+        lag: how many in-sequence measurements are stored, >= 1, each with the mean and covariance
+            after it: what the state holds does not grow with lag times N. A measurement older than
+            all of them, or than t0, is `TOO_LATE`.
+        smoother: "eks", "uks" or "ps".
+        smoother_particles: M >= 2 for "ps"; default N / 10.
+        resampling, ess_threshold: as in `bootstrap`.
+        collapse: as in `pf_retrodict`.
+        ut_alpha, ut_beta, ut_kappa: of "uks", as in `unscented`. The paper has 1e-3, 2 and 0, which
+            float32 cannot carry (refused).
+
+    For one late measurement, and for several of which the earlier are part of the stored
+    summaries, all three converge to the posterior of a linear model ("ps" as M grows too);
+    otherwise what an earlier late measurement said about the time between is forgotten. A summary
+    is one Gaussian: where the filtered density has several modes, so much is lost.
+
+    Gradients as in `bootstrap`.
+
+    Reduces to: `bootstrap` in sequence and at delay 0.
+
+    Raises:
+        ValueError: fewer than 2 particles; lag < 1; an unknown smoother; collapse < 1; `init`
+            without a key or a prior.
+
+    Deviations: as in the two smoothers. A late measurement in the last interval sees x(k) as a
+        measurement of x(tau), not of x(k-1) as Remark 2 prints.
+    """
+    kind = form.cloud(model, particles, resampling, ess_threshold)
+    collapse = form.collapse_factor(collapse)
+    slots = checks.whole("lag", lag, 1) + 1
+    checks.require(smoother in ("eks", "uks", "ps"), "smoother", "'eks', 'uks' or 'ps'", smoother)
+    few = max(particles // 10, 2) if smoother_particles is None else smoother_particles
+    few = checks.whole("smoother_particles", few, 2)
+    points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if smoother == "uks" else None
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> SummaryState:
+        first = form.draw(kind, "pf_fixed_point", prior, t0, key)
+        assert prior is not None
+        dtype = first.time.dtype
+        if points is not None:
+            transform(points, params, 2 * first.particles.shape[0], dtype)
+        cov = symmetric.pack(jnp.asarray(prior.cov, dtype))
+        known = CovarianceState(first.time, jnp.asarray(prior.mean), cov)
+        m = _size(model, params, known)
+        nothing = Measurement(
+            first.time, jnp.zeros(m, dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
+        )
+        past, measured = jax.tree.map(lambda x: jnp.stack([x] * slots), (known, nothing))
+        return SummaryState(*first, past, measured)
+
+    def predict(params: Any, state: SummaryState, time: Array) -> SummaryState:
+        time = jnp.asarray(time, state.time.dtype)
+        return form.leave(state, time, lambda s: form.step_ahead(kind, params, s, time)[0])
+
+    def update(
+        params: Any, state: SummaryState, measurement: Measurement
+    ) -> tuple[SummaryState, Info]:
+        late = measurement.time < state.time
+        known, start = last_before(state.past, measurement.time)
+        tau = jnp.clip(measurement.time, start.time, state.time)
+
+        def in_sequence(state: SummaryState) -> tuple[Seen, Array]:
+            seen = form.look(model, params, state.particles, state.log_weights, measurement)
+            return seen, state.key
+
+        def smoothed(state: SummaryState) -> tuple[Seen, Array]:
+            key, ours = jax.random.split(state.key)
+            stored = jax.tree.map(lambda x: x[::-1], state.measured)
+            if smoother == "ps":
+                last = lines(model, params, start, tau, stored, state.time, few, ours)
+                return look_back(model, params, last, state.time, state, measurement), key
+            past = fixed_point(model, points, params, start, tau, stored, state.time)
+            return _look_through(model, params, past, state, measurement), key
+
+        seen, key = lax.cond(late & known, smoothed, in_sequence, state)
+        log_weights, info = form.weigh(state, seen, measurement, known, collapse)
+        weighed = state._replace(log_weights=log_weights, key=key)
+        return _remembered(weighed, measurement, form.was_used(info)), info
+
+    def estimate(params: Any, state: SummaryState) -> Gaussian:
+        del params
+        return form.summary(state)
+
+    return Estimator(init, predict, update, estimate)
+
+
+def _size(model: Model, params: Any, at: CovarianceState) -> int:
+    """How many components a measurement has."""
+    sensor = jnp.zeros((), jnp.int32)
+    return jax.eval_shape(lambda: model.observe(params, at.mean, sensor, at.time)).shape[0]
+
+
+def _look_through(
+    model: Model, params: Any, past: Conditional, state: SummaryState, measurement: Measurement
+) -> Seen:
+    """A late measurement as it is seen by particles now, through the state at its time."""
+    time, value, sensor, mask = measurement
+
+    def one(x: Array) -> tuple[Array, Array, Array]:
+        there = given(past, x)
+        predicted, H, R = sight(model, params, there.mean, sensor, time)
+        checks.shape("measurement.value", value, (R.shape[0],))
+        difference = model.residual(value, predicted, sensor)
+        innovation = gaussian.innovate(difference, H, matmul(matmul(H, there.cov), H.T) + R, mask)
+        return innovation.value, innovation.cov, gaussian.log_density(innovation, mask)
+
+    difference, cov, log_density = jax.vmap(one, -1, -1)(state.particles)
+    good = jnp.isfinite(log_density)
+    weights = jnp.where(good, jnp.exp(state.log_weights), 0)
+    innovation, spread = form.moments(jnp.where(good[None], difference, 0), weights)
+    innovation_cov = jnp.where(good[None, None], cov, 0) @ weights + spread
+    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, innovation_cov)
+
+
+def _remembered(state: SummaryState, measurement: Measurement, used: Array) -> SummaryState:
+    """The state with its present mean and covariance in place of those of the same time, or, after
+    an in-sequence measurement or at a new time, in front of them."""
+    mean, cov = form.summary(state)
+    now = CovarianceState(state.time, mean, symmetric.pack(cov))
+    late = measurement.time < state.time
+    taken = measurement._replace(time=state.time, mask=measurement.mask & ~late)
+    again = late & (state.past.time[0] == state.time)
+
+    def push(table: Any, row: Any) -> Any:
+        return jax.tree.map(lambda x, new: jnp.concatenate([new[None], x[:-1]]), table, row)
+
+    def replaced(table: Any, row: Any) -> Any:
+        return jax.tree.map(lambda x, new: x.at[0].set(new), table, row)
+
+    pushed = push(state.past, now), push(state.measured, taken)
+    rewritten = replaced(state.past, now), state.measured
+    past, measured = jax.tree.map(
+        lambda a, b, c: jnp.where(used, jnp.where(again, a, b), c),
+        rewritten,
+        pushed,
+        (state.past, state.measured),
+    )
+    return state._replace(past=past, measured=measured)

@@ -1,0 +1,85 @@
+"""Particles moved back to the time of a late measurement."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax.forms import particles as form
+from ewif_jax.forms.particles import ParticleState, Seen
+from ewif_jax.kernels.resampling import Resampling
+from ewif_jax.models import Model
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+
+
+def pf_retrodict(
+    model: Model,
+    particles: int,
+    resampling: Resampling = "systematic",
+    ess_threshold: float = 0.5,
+    collapse: float | None = 100.0,
+) -> Estimator:
+    r"""The bootstrap filter that weighs by a late measurement with particles moved back to it.
+
+    .. math::
+        x^i(l) = f_{l,k}(x^i(k) - v^i), \quad v^i \sim N(0, Q(k, l)) \quad (88), (89) \qquad
+        w^i(k|l^+) \propto w^i(k)\, p(z(l) | x^i(l)) \quad (90)
+
+    Mallick, Kirubarajan & Arulampalam (2002) as in Pornsarayouth & Yamakita (87)-(92). Nothing is
+    stored, so a late measurement of any age is used.
+
+    The noise drawn in (88) knows nothing of the noise that really acted, so more particles do not
+    lead to the posterior: the limit for a linear model is a Kalman update with
+    :math:`H^* = H F^{-1}, R^* = R + H^* Q H^{*\prime}`, which reports too small a variance and is
+    unstable at long delays. Use `pf_extended` or `pf_fixed_point` where that matters.
+
+    Args:
+        model: linear or not; it must allow motion back in time, and its process noise must compose
+            over parts of an interval. R must be positive definite.
+        particles: N >= 2.
+        resampling, ess_threshold: as in `bootstrap`.
+        collapse: a late measurement that divides the effective sample size by more than this is
+            `REJECTED` (Orguner & Gustafsson, section IV); None: never.
+
+    Gradients as in `bootstrap`.
+
+    Reduces to: `bootstrap` in sequence and at delay 0.
+
+    Raises:
+        ValueError: fewer than 2 particles; collapse < 1; `init` without a key or a prior.
+
+    Deviations: (91) prints x(k|l) for x(k|l+). Resampling (step 8) waits until the filter moves on.
+    """
+    kind = form.cloud(model, particles, resampling, ess_threshold)
+    collapse = form.collapse_factor(collapse)
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ParticleState:
+        del params
+        return form.draw(kind, "pf_retrodict", prior, t0, key)
+
+    def predict(params: Any, state: ParticleState, time: Array) -> ParticleState:
+        time = jnp.asarray(time, state.time.dtype)
+        return form.leave(state, time, lambda s: form.step_ahead(kind, params, s, time)[0])
+
+    def update(
+        params: Any, state: ParticleState, measurement: Measurement
+    ) -> tuple[ParticleState, Info]:
+        def back(state: ParticleState) -> tuple[Array, Array]:
+            key, ours = jax.random.split(state.key)
+            then = jnp.minimum(measurement.time, state.time)
+            Q = jnp.asarray(model.process_cov(params, then, state.time), state.time.dtype)
+            origin = state.particles - form.noise(ours, Q, particles)
+            return form.transported(model, params, origin, state.time, then), key
+
+        late = measurement.time < state.time
+        there, key = lax.cond(late, back, lambda s: (s.particles, s.key), state)
+        seen: Seen = form.look(model, params, there, state.log_weights, measurement)
+        log_weights, info = form.weigh(state, seen, measurement, True, collapse)
+        return state._replace(log_weights=log_weights, key=key), info
+
+    def estimate(params: Any, state: ParticleState) -> Gaussian:
+        del params
+        return form.summary(state)
+
+    return Estimator(init, predict, update, estimate)

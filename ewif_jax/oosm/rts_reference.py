@@ -1,0 +1,125 @@
+"""The smoother as a reference for late measurements: back through every stored time."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.forms.covariance import CovarianceState
+from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.models import Model, flow, sight
+from ewif_jax.oosm.history import HistoryState, last_before, one_step, too_late
+from ewif_jax.types import Estimator, Info, Measurement, Status
+
+
+class Tie(NamedTuple):
+    """How the state of an earlier time hangs on the present one, given the data:
+    x(time) = mean + A (x_now - its mean) + e, e independent with covariance `cov` (packed)."""
+
+    time: Array
+    mean: Array
+    A: Array
+    cov: Array
+
+
+def rts_reference(model: Model, lag: int) -> Estimator:
+    r"""The Kalman filter that smooths back to a late measurement's time, one stored time after
+    the other.
+
+    .. math::
+        \hat x^s(j|k) &= \hat x(j|j) + G_j (\hat x^s(j+1|k) - \hat x(j+1|j)) \quad (93), \qquad
+        G_j = P(j|j) F' P(j+1|j)^{-1} \\
+        P^s(j|k) &= P(j|j) + G_j (P^s(j+1|k) - P(j+1|j)) G_j' \quad (94), \qquad
+        P(k, j|k) = P(k, j+1|k) G_j'
+
+    down to :math:`t_l`, where the last stored estimate before it is predicted; then (9) and (10).
+    Pornsarayouth & Yamakita call it the RTS-based reference. The recursion is carried as
+    :math:`x_j = \hat x^s_j + A_j (x_k - \hat x_k) + e_j` with :math:`A_j = G_j A_{j+1}` and
+    :math:`\mathrm{cov}(e_j) = G_j \mathrm{cov}(e_{j+1}) G_j' + (I - G_j F) P(j|j) (I - G_j F)' +
+    G_j Q G_j'`, a sum of positive semidefinite terms, which makes the late measurement one of the
+    present state with :math:`\tilde H = H A_l,\; \tilde R = R + H \mathrm{cov}(e_l) H'`.
+
+    The cost is that of `lag` smoothing steps for every measurement. Estimates are stored as in
+    `al1`, and never rewritten.
+
+    Args:
+        model: linear or not (Jacobians at the filtered means); its process noise must compose over
+            parts of an interval. Motion back in time is not needed.
+        lag: how many past update times are kept, >= 1. A measurement older than all of them, or
+            than t0, is `TOO_LATE`.
+
+    Exact for a single late measurement of a linear model. A second one of a time before an earlier
+    late measurement's arrival meets stored estimates that do not know that one.
+
+    Reduces to: `kalman` (or `extended`) at delay 0; `a1` for lag = 1.
+
+    Deviations: (94) prints the last factor transposed.
+
+    Raises:
+        ValueError: lag < 1; `init` with `prior=None`.
+    """
+    form = one_step(model, "rts_reference", lag, noise_estimated=True)
+
+    def update(
+        params: Any, state: HistoryState, measurement: Measurement
+    ) -> tuple[HistoryState, Info]:
+        known, start = last_before(state.past, measurement.time)
+        at = jnp.clip(measurement.time, start.time, state.time)
+        tie = _tied(model, params, state, start, at)
+        predicted, H, R = sight(model, params, tie.mean, measurement.sensor, measurement.time)
+        checks.shape("measurement.value", measurement.value, (H.shape[0],))
+        R = R + matmul(matmul(H, symmetric.unpack(tie.cov)), H.T)
+        difference = model.residual(measurement.value, predicted, measurement.sensor)
+        mean, cov, innovation = gaussian.update(
+            state.mean, state.cov, difference, matmul(H, tie.A), R, measurement.mask
+        )
+        updated = state._replace(mean=mean, cov=cov, used=jnp.asarray(True))
+        late, present = measurement.time < state.time, jnp.any(measurement.mask)
+        info = Info(
+            innovation.value,
+            innovation.cov,
+            gaussian.log_density(innovation, measurement.mask),
+            state.time - measurement.time,
+            verdict(late, present, Status.LATE_USED),
+        )
+        return choose(known & present, updated, state), too_late(info, ~known)
+
+    return form._replace(update=update)
+
+
+def _tied(
+    model: Model, params: Any, state: HistoryState, start: CovarianceState, time: Array
+) -> Tie:
+    """The state at `time`, between `start` and now, tied to the present one."""
+
+    def back(tie: Tie, slot: CovarianceState) -> tuple[Tie, None]:
+        return choose(slot.time > time, _behind(model, params, tie, slot), tie), None
+
+    n = state.mean.shape[0]
+    now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
+    nearest, _ = lax.scan(back, now, state.past)
+    mean, F, Q = flow(model, params, start.mean, start.time, time)
+    cov = symmetric.congruence(F, start.cov) + symmetric.pack(Q)
+    tie = _behind(model, params, nearest, CovarianceState(time, mean, cov))
+    return choose(time < nearest.time, tie, nearest)
+
+
+def _behind(model: Model, params: Any, tie: Tie, slot: CovarianceState) -> Tie:
+    """One smoothing step from `tie` to the estimate `slot` of an earlier time."""
+    end = jnp.maximum(tie.time, slot.time)
+    predicted, F, Q = flow(model, params, slot.mean, slot.time, end)
+    full = symmetric.unpack(slot.cov)
+    cross = matmul(F, full)
+    spread = matmul(cross, F.T) + Q
+    G = cholesky.solved((spread + spread.T) / 2, cross).T
+    rest = jnp.eye(G.shape[0], dtype=G.dtype) - matmul(G, F)
+    cov = symmetric.congruence(G, tie.cov + symmetric.pack(Q))
+    return Tie(
+        slot.time,
+        slot.mean + matvec(G, tie.mean - predicted),
+        matmul(G, tie.A),
+        cov + symmetric.congruence(rest, slot.cov),
+    )

@@ -1,0 +1,180 @@
+"""Data saturation, section 4 of Anderson (1973): a filter that trusts a constant too long, and
+three remedies."""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ewif_jax.monte_carlo import monte_carlo
+from ewif_jax.scenarios.divergence import (
+    PUSHES,
+    REMEDIES,
+    Push,
+    Remedy,
+    divergence,
+    divergence_curve,
+    divergence_filter,
+)
+from ewif_jax.study import divergence_figures as figures
+from ewif_jax.study.experiment import Experiment, Measured
+from ewif_jax.study.folder import Arrays
+
+EPS, LENGTH = 0.3, 20.0
+GAINS = np.geomspace(0.05, 5.0, 60)
+"""steady gains in 1/s over which the remedies are compared"""
+UNITS = {"noise": "1/s", "weighting": "1/s", "memory": "s"}
+TEXT = {
+    "none": "none",
+    "noise": "more process noise",
+    "weighting": "exponential weighting",
+    "memory": "limited memory",
+}
+
+
+def setting_for(remedy: Remedy, gain: Any) -> Any:
+    """The setting whose weight on the newest data settles at `gain` in 1/s: q = gain^2,
+    alpha = gain / 2, or a memory of 1 / gain seconds; None where there is nothing to set."""
+    return {"none": None, "noise": gain**2, "weighting": gain / 2, "memory": 1 / gain}[remedy]
+
+
+def chosen(remedy: Remedy, dt: float) -> float | None:
+    """The setting with the least final error under the white push: gain sqrt(eps), or a memory of
+    sqrt(3 / eps) s (whole samples)."""
+    if remedy == "memory":
+        return round(np.sqrt(3 / EPS) / dt) * dt
+    return setting_for(remedy, np.sqrt(EPS))
+
+
+def closed_forms(dt: float) -> list[dict[str, Any]]:
+    """Every closed form of the mean square error, as text and as a number for `EPS`: at `LENGTH`
+    without a remedy, and once settled with one. `printed` is what the paper's formula gives."""
+    K, M, t = np.sqrt(EPS), chosen("memory", dt) or 0.0, LENGTH + 1
+    bias = EPS / 2 * (t - 1 / t)
+    rows = [
+        ("white", "none", "ε(t+1)/3 + 1/(t+1) - ε/(3(t+1)²)",
+         EPS * t / 3 + 1 / t - EPS / (3 * t**2), EPS * t / 3 + 1 / t - EPS / (3 * t**2)),
+        ("constant", "none", "1/(t+1) + (ε²/4)(t+1 - 1/(t+1))²", 1 / t + bias**2,
+         1 / t + EPS * t / 2),
+        ("white", "noise", "√q/2 + ε/(2√q)", K / 2 + EPS / (2 * K), None),
+        ("constant", "noise", "√q/2 + ε²/q", K / 2 + (EPS / K) ** 2, None),
+        ("white", "weighting", "(ε + 4α²)/(4α)", (EPS + K**2) / (2 * K), None),
+        ("constant", "weighting", "α + (ε/(2α))²", K / 2 + (EPS / K) ** 2, None),
+        ("white", "memory", "1/M + εM/3", 1 / M + EPS * M / 3, None),
+        ("constant", "memory", "1/M + (εM/2)²", 1 / M + (EPS * M / 2) ** 2, None),
+    ]  # fmt: skip
+    names = ("push", "remedy", "formula", "value", "printed")
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def run(experiment: Experiment) -> None:
+    """Simulates every remedy under both pushes and compares with the exact curves."""
+    quick = experiment.options.quick
+    runs, dt = experiment.size(4000, 200), 0.1 if quick else 0.02
+    time = np.arange(1, round(LENGTH / dt) + 1) * dt
+    found: dict[tuple[Push, Remedy], Arrays] = {}
+    for push, remedy in product(PUSHES, REMEDIES):
+        found[push, remedy] = experiment.piece(
+            f"{push}-{remedy}", lambda p=push, r=remedy: _simulated(experiment, p, r, runs, dt)
+        )
+    exact = {
+        (push, remedy): np.asarray(
+            divergence_curve(remedy, push, time, eps=EPS, setting=chosen(remedy, dt))
+        )
+        for push, remedy in found
+    }
+    final = {
+        (push, remedy): np.asarray([
+            divergence_curve(remedy, push, [LENGTH], eps=EPS, setting=setting_for(remedy, gain))[0]
+            for gain in GAINS
+        ])
+        for push, remedy in product(PUSHES, REMEDIES[1:])
+    }  # fmt: skip
+    rows = [
+        _row(push, remedy, one, exact[push, remedy], dt) for (push, remedy), one in found.items()
+    ]
+    forms = [
+        {**form, "simulated": rows[i]["simulated"], "off by [s.e.]": _off(form, rows[i])}
+        for form in closed_forms(dt)
+        for i in range(len(rows))
+        if (rows[i]["push"], rows[i]["key"]) == (form["push"], form["remedy"])
+    ]
+    experiment.arrays("divergence", _dataset(time, found, exact, final))
+    experiment.figure("divergence", figures.growth(time, found, exact, TEXT))
+    experiment.figure("settings", figures.settings(GAINS, final, found, np.sqrt(EPS), TEXT))
+    experiment.table(
+        "closed_forms", f"Mean square error in closed form, ε = {EPS:g}", forms,
+        [f"at t = {LENGTH:g} s without a remedy, settled with one; simulated at t = {LENGTH:g} s.",
+         "off by: simulated minus the printed formula (ours where nothing is printed)."],
+    )  # fmt: skip
+    experiment.table(
+        "divergence", f"A constant that is pushed: {runs} runs of {LENGTH:g} s, ε = {EPS:g}",
+        [{k: v for k, v in row.items() if k != "key"} for row in rows],
+        ["mean square error at the end; exact is that of the continuous filter, the simulated one",
+         f"is sampled every {dt:g} s. halfway: exact, at half the time. The settings are those",
+         "with the least final error under the white push."],
+    )  # fmt: skip
+    experiment.finish()
+
+
+def _simulated(
+    experiment: Experiment, push: Push, remedy: Remedy, runs: int, dt: float
+) -> dict[str, np.ndarray]:
+    """Mean square errors (T,) and their standard errors, and what the filter believed at the end
+    is left to the exact curves."""
+    label = f"{push} push, {TEXT[remedy]}"
+    with experiment.timed(label), experiment.progress(label) as report:
+        measured = monte_carlo(
+            divergence_filter(remedy, dt=dt, setting=chosen(remedy, dt)),
+            None,
+            divergence(push, eps=EPS, dt=dt, length=LENGTH),
+            runs=runs,
+            key=experiment.key(PUSHES.index(push)),
+            chunk=experiment.options.chunk,
+            progress=report,
+        )
+    return {
+        "mse": measured.per_step["squared_error"],
+        "mse_se": measured.per_step_se["squared_error"],
+    }
+
+
+def _row(push: Push, remedy: Remedy, one: Arrays, exact: np.ndarray, dt: float) -> dict[str, Any]:
+    value = chosen(remedy, dt)
+    return {
+        "push": push,
+        "remedy": TEXT[remedy],
+        "setting": "" if value is None else f"{value:.4g} {UNITS[remedy]}",
+        "simulated": Measured(float(one["mse"][-1]), float(one["mse_se"][-1])),
+        "exact": float(exact[-1]),
+        "halfway": float(exact[exact.size // 2 - 1]),
+        "key": remedy,
+    }
+
+
+def _off(form: dict[str, Any], row: dict[str, Any]) -> float:
+    """How many standard errors the simulation lies above the formula."""
+    formula = form["value"] if form["printed"] is None else form["printed"]
+    return (row["simulated"].value - formula) / row["simulated"].error
+
+
+def _dataset(time: np.ndarray, found: Any, exact: Any, final: Any) -> xr.Dataset:
+    def stacked(x: Any, names: tuple[str, ...], last: str) -> xr.DataArray:
+        table = np.stack([[x[push, name] for name in names] for push in PUSHES])
+        return xr.DataArray(
+            table, dims=("push", "remedy", last), attrs={"units": "1"},
+            coords={"push": list(PUSHES), "remedy": list(names)},
+        )  # fmt: skip
+
+    simulated = {
+        name: stacked({k: v[name] for k, v in found.items()}, REMEDIES, "time")
+        for name in ("mse", "mse_se")
+    }
+    return xr.Dataset(
+        {
+            **simulated,
+            "mse_exact": stacked(exact, REMEDIES, "time"),
+            "final_mse_by_gain": stacked(final, REMEDIES[1:], "gain").rename(remedy="set_remedy"),
+        }
+    ).assign_coords(time=("time", time, {"units": "s"}), gain=("gain", GAINS, {"units": "1/s"}))
