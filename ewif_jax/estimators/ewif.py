@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import verdict
 from ewif_jax.forms import information as form
 from ewif_jax.forms.information import InformationState
 from ewif_jax.models.model import Model, need_linear, resolve
@@ -82,7 +82,7 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         updated, info = form.absorb(model, params, state, measurement, w2)
         late = measurement.time < state.time
         status = verdict(late, present, Status.LATE_USED)
-        return choose(present, updated, state), info._replace(status=status)
+        return updated, info._replace(status=status)
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
         del params

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import verdict
 from ewif_jax.forms import information as form
 from ewif_jax.forms.information import InformationState
 from ewif_jax.kernels import symmetric
@@ -64,15 +64,12 @@ def information(model: Model) -> Estimator:
     ) -> tuple[InformationState, Info]:
         late = measurement.time < state.time
         present = jnp.any(measurement.mask)
-        here = measurement._replace(time=jnp.maximum(measurement.time, state.time))
-        updated, info = form.absorb(model, params, state, here, 1.0)
-        used = present & ~late
-        info = info._replace(
-            log_likelihood=jnp.where(used, info.log_likelihood, 0),
-            delay=state.time - measurement.time,
-            status=verdict(late, present),
+        here = measurement._replace(
+            time=jnp.maximum(measurement.time, state.time), mask=measurement.mask & ~late
         )
-        return choose(used, updated, state), info
+        updated, info = form.absorb(model, params, state, here, 1.0)
+        delay = state.time - measurement.time
+        return updated, info._replace(delay=delay, status=verdict(late, present))
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
         del params

@@ -47,25 +47,25 @@ def chosen(remedy: Remedy, dt: float) -> float | None:
     return setting_for(remedy, np.sqrt(EPS))
 
 
-def closed_forms(dt: float) -> list[dict[str, Any]]:
+def closed_forms(dt: float) -> dict[tuple[Push, Remedy], tuple[str, float]]:
     """Every closed form of the mean square error, as text and as a number for `EPS`: at `LENGTH`
-    without a remedy, and once settled with one. `printed` is what the paper's formula gives."""
+    without a remedy, and once settled with one."""
     K, M, t = np.sqrt(EPS), chosen("memory", dt) or 0.0, LENGTH + 1
-    bias = EPS / 2 * (t - 1 / t)
-    rows = [
-        ("white", "none", "ε(t+1)/3 + 1/(t+1) - ε/(3(t+1)²)",
-         EPS * t / 3 + 1 / t - EPS / (3 * t**2), EPS * t / 3 + 1 / t - EPS / (3 * t**2)),
-        ("constant", "none", "1/(t+1) + (ε²/4)(t+1 - 1/(t+1))²", 1 / t + bias**2,
-         1 / t + EPS * t / 2),
-        ("white", "noise", "√q/2 + ε/(2√q)", K / 2 + EPS / (2 * K), None),
-        ("constant", "noise", "√q/2 + ε²/q", K / 2 + (EPS / K) ** 2, None),
-        ("white", "weighting", "(ε + 4α²)/(4α)", (EPS + K**2) / (2 * K), None),
-        ("constant", "weighting", "α + (ε/(2α))²", K / 2 + (EPS / K) ** 2, None),
-        ("white", "memory", "1/M + εM/3", 1 / M + EPS * M / 3, None),
-        ("constant", "memory", "1/M + (εM/2)²", 1 / M + (EPS * M / 2) ** 2, None),
-    ]  # fmt: skip
-    names = ("push", "remedy", "formula", "value", "printed")
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    white, steady = K / 2 + EPS / (2 * K), K / 2 + (EPS / K) ** 2
+    return {
+        ("white", "none"): (
+            "ε(t+1)/3 + 1/(t+1) - ε/(3(t+1)²)", EPS * t / 3 + 1 / t - EPS / (3 * t**2)
+        ),
+        ("constant", "none"): (
+            "1/(t+1) + (ε²/4)(t+1 - 1/(t+1))²", 1 / t + (EPS / 2 * (t - 1 / t)) ** 2
+        ),
+        ("white", "noise"): ("K/2 + ε/(2K), K = √q", white),
+        ("constant", "noise"): ("K/2 + (ε/K)², K = √q", steady),
+        ("white", "weighting"): ("K/2 + ε/(2K), K = 2 alpha", white),
+        ("constant", "weighting"): ("K/2 + (ε/K)², K = 2 alpha", steady),
+        ("white", "memory"): ("1/M + εM/3", 1 / M + EPS * M / 3),
+        ("constant", "memory"): ("1/M + (εM/2)²", 1 / M + (EPS * M / 2) ** 2),
+    }  # fmt: skip
 
 
 def run(experiment: Experiment) -> None:
@@ -73,47 +73,42 @@ def run(experiment: Experiment) -> None:
     quick = experiment.options.quick
     runs, dt = experiment.size(4000, 200), 0.1 if quick else 0.02
     time = np.arange(1, round(LENGTH / dt) + 1) * dt
-    found: dict[tuple[Push, Remedy], Arrays] = {}
-    for push, remedy in product(PUSHES, REMEDIES):
-        found[push, remedy] = experiment.piece(
+    cases = list(product(PUSHES, REMEDIES))
+    found = {
+        (push, remedy): experiment.piece(
             f"{push}-{remedy}", lambda p=push, r=remedy: _simulated(experiment, p, r, runs, dt)
         )
+        for push, remedy in cases
+    }
     exact = {
         (push, remedy): np.asarray(
             divergence_curve(remedy, push, time, eps=EPS, setting=chosen(remedy, dt))
         )
-        for push, remedy in found
+        for push, remedy in cases
     }
     final = {
         (push, remedy): np.asarray([
             divergence_curve(remedy, push, [LENGTH], eps=EPS, setting=setting_for(remedy, gain))[0]
             for gain in GAINS
         ])
-        for push, remedy in product(PUSHES, REMEDIES[1:])
+        for push, remedy in cases if remedy != "none"
     }  # fmt: skip
-    rows = [
-        _row(push, remedy, one, exact[push, remedy], dt) for (push, remedy), one in found.items()
-    ]
-    forms = [
-        {**form, "simulated": rows[i]["simulated"], "off by [s.e.]": _off(form, rows[i])}
-        for form in closed_forms(dt)
-        for i in range(len(rows))
-        if (rows[i]["push"], rows[i]["key"]) == (form["push"], form["remedy"])
-    ]
     experiment.arrays("divergence", _dataset(time, found, exact, final))
     experiment.figure("divergence", figures.growth(time, found, exact, TEXT))
-    experiment.figure("settings", figures.settings(GAINS, final, found, np.sqrt(EPS), TEXT))
+    experiment.figure("settings", figures.settings(GAINS, final, exact, np.sqrt(EPS), TEXT))
+    forms = closed_forms(dt)
+    rows = [_row(case, found[case], exact[case], forms[case], dt) for case in cases]
+    printed = 1 / (LENGTH + 1) + EPS * (LENGTH + 1) / 2
+    unremedied = rows[cases.index(("constant", "none"))]["simulated"]
+    off = (unremedied.value - printed) / unremedied.error
     experiment.table(
-        "closed_forms", f"Mean square error in closed form, ε = {EPS:g}", forms,
-        [f"at t = {LENGTH:g} s without a remedy, settled with one; simulated at t = {LENGTH:g} s.",
-         "off by: simulated minus the printed formula (ours where nothing is printed)."],
-    )  # fmt: skip
-    experiment.table(
-        "divergence", f"A constant that is pushed: {runs} runs of {LENGTH:g} s, ε = {EPS:g}",
-        [{k: v for k, v in row.items() if k != "key"} for row in rows],
-        ["mean square error at the end; exact is that of the continuous filter, the simulated one",
-         f"is sampled every {dt:g} s. halfway: exact, at half the time. The settings are those",
-         "with the least final error under the white push."],
+        "divergence", f"A constant that is pushed: {runs} runs of {LENGTH:g} s, ε = {EPS:g}", rows,
+        [f"Mean square error at the end; the simulated filters are sampled every {dt:g} s, exact",
+         "is the continuous filter's, halfway the same at half the time, and the formula is that",
+         "of the settled filter (at the end without a remedy). The settings are those with the",
+         "least final error under the white push.",
+         "Without a remedy and with a constant push the paper prints 1/(t+1) + ε(t+1)/2 =",
+         f"{printed:.4g}: the simulation is {off:.0f} standard errors above it."],
     )  # fmt: skip
     experiment.finish()
 
@@ -121,8 +116,7 @@ def run(experiment: Experiment) -> None:
 def _simulated(
     experiment: Experiment, push: Push, remedy: Remedy, runs: int, dt: float
 ) -> dict[str, np.ndarray]:
-    """Mean square errors (T,) and their standard errors, and what the filter believed at the end
-    is left to the exact curves."""
+    """Mean square errors (T,) and their standard errors."""
     label = f"{push} push, {TEXT[remedy]}"
     with experiment.timed(label), experiment.progress(label) as report:
         measured = monte_carlo(
@@ -140,23 +134,21 @@ def _simulated(
     }
 
 
-def _row(push: Push, remedy: Remedy, one: Arrays, exact: np.ndarray, dt: float) -> dict[str, Any]:
-    value = chosen(remedy, dt)
+def _row(
+    case: tuple[Push, Remedy], one: Arrays, exact: np.ndarray, form: tuple[str, float], dt: float
+) -> dict[str, Any]:
+    push, remedy = case
+    setting = chosen(remedy, dt)
     return {
         "push": push,
         "remedy": TEXT[remedy],
-        "setting": "" if value is None else f"{value:.4g} {UNITS[remedy]}",
+        "setting": "" if setting is None else f"{setting:.4g} {UNITS[remedy]}",
         "simulated": Measured(float(one["mse"][-1]), float(one["mse_se"][-1])),
         "exact": float(exact[-1]),
         "halfway": float(exact[exact.size // 2 - 1]),
-        "key": remedy,
+        "formula": form[0],
+        "its value": form[1],
     }
-
-
-def _off(form: dict[str, Any], row: dict[str, Any]) -> float:
-    """How many standard errors the simulation lies above the formula."""
-    formula = form["value"] if form["printed"] is None else form["printed"]
-    return (row["simulated"].value - formula) / row["simulated"].error
 
 
 def _dataset(time: np.ndarray, found: Any, exact: Any, final: Any) -> xr.Dataset:

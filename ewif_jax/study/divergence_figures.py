@@ -6,11 +6,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ewif_jax.study.figures import (
-    EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label, plain_ticks,
-)  # fmt: skip
+    EWIF,
+    KALMAN,
+    MEASURED,
+    OTHER,
+    TRUTH,
+    canvas,
+    label,
+    plain_ticks,
+)
 
 COLOR = {"none": TRUTH, "noise": KALMAN, "weighting": EWIF, "memory": OTHER}
-STYLE = {"none": "-", "noise": "--", "weighting": "-", "memory": "-"}
+STYLE = {"none": "-", "noise": (0, (4, 4)), "weighting": "-", "memory": "-"}
+ABOVE = {"none": 2.0, "noise": 2.2, "weighting": 2.1, "memory": 2.0}
+"""what covers what: two of the lines coincide"""
 POINTS = 14
 
 
@@ -20,7 +29,8 @@ def growth(time: np.ndarray, found: Mapping, exact: Mapping, text: Mapping[str, 
     figure, axes = canvas(1, 2, width=11, height=4.6, sharey=True)
     for ax, push in zip(axes, ("white", "constant"), strict=True):
         for shift, (remedy, color) in enumerate(COLOR.items()):
-            ax.semilogy(time, exact[push, remedy], STYLE[remedy], color=color, linewidth=1.6)
+            line = {"color": color, "linestyle": STYLE[remedy], "zorder": ABOVE[remedy]}
+            ax.semilogy(time, exact[push, remedy], linewidth=1.6, **line)
             at = np.linspace(0, time.size - 1, 4 * POINTS + 5).astype(int)[4 + shift :: 4]
             one = found[push, remedy]
             ax.errorbar(
@@ -33,23 +43,26 @@ def growth(time: np.ndarray, found: Mapping, exact: Mapping, text: Mapping[str, 
     plain_ticks(axes[0])
     axes[0].plot([], [], color=MEASURED, label="lines: exact; points: simulated ± 2 s.e.")
     axes[0].legend(frameon=False, fontsize="small", loc="upper left", ncols=2)
-    axes[0].set_ylim(top=60)
+    axes[0].set_ylim(top=40)
     return figure
 
 
 def settings(
-    gains: np.ndarray, final: Mapping, found: Mapping, used: float, text: Mapping[str, str]
+    gains: np.ndarray, final: Mapping, exact: Mapping, used: float, text: Mapping[str, str]
 ) -> Figure:
     """Error at the end against how fast each remedy forgets, and the error without one."""
     figure, axes = canvas(1, 2, width=11, height=4.2, sharey=True)
     for ax, push in zip(axes, ("white", "constant"), strict=True):
-        ax.axhline(found[push, "none"]["mse"][-1], color=TRUTH, label="no remedy (simulated)")
+        ax.axhline(exact[push, "none"][-1], color=TRUTH, label="no remedy")
         for remedy, color in list(COLOR.items())[1:]:
             curve = final[push, remedy]
-            ax.loglog(gains, curve, STYLE[remedy], color=color, linewidth=1.6, label=text[remedy])
+            line = {"color": color, "linestyle": STYLE[remedy], "zorder": ABOVE[remedy]}
+            ax.loglog(gains, curve, linewidth=1.6, label=text[remedy], **line)
             best = int(np.argmin(curve))
             ax.plot(gains[best], curve[best], "o", color=color, fillstyle="none")
-        ax.axvline(used, color=MEASURED, linewidth=0.8, linestyle=":", label="√ε, used elsewhere")
+        ax.axvline(
+            used, color=MEASURED, linewidth=0.8, linestyle=":", label="√ε, best for the white push"
+        )
         label(ax, "gain, or 1 / memory [1/s]", "", f"{push} push (circles: least)")
         plain_ticks(ax)
     axes[0].set_ylabel("mean square error at the end [1]")

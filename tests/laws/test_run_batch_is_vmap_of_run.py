@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ewif_jax as ej
+from ewif_jax import layout
 
 RUNS, STEPS = 5, 12
 SENSORS = [ej.models.position_sensor(r, dims=2) for r in (0.5, 2.0)]
@@ -53,3 +54,40 @@ def test_run_batch_is_vmap_of_run(name, shared):
             getattr(wanted, field),
         )
     assert jnp.all(jnp.isfinite(got.mean))
+
+
+@pytest.mark.parametrize("cache", [1, 16 * 8 * (1 + 4 + 10)], ids=["one_by_one", "in_groups"])
+def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
+    monkeypatch.setattr(layout, "_CACHE", cache)
+    runs, steps = 32, 96
+    rng = np.random.default_rng(5)
+    time = np.cumsum(rng.uniform(0.1, 1.0, (runs, steps)), 1)
+    batch = ej.Measurement(
+        time, rng.normal(size=(runs, steps, 2)), np.zeros(steps, int), np.ones((steps, 2), bool)
+    )
+    q = np.linspace(0.1, 2.0, runs)
+    assert layout.group_size(runs, 8 * (1 + 4 + 10)) == (1 if cache == 1 else 16)
+    assert layout._block(steps) == 48
+    estimator = ej.kalman(MODEL)
+    got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
+    for k in (0, 17, 31):
+        one = jax.tree.map(lambda x: x[k] if x.ndim > 1 and len(x) == runs else x, batch)
+        wanted = ej.run(estimator, {"q": q[k]}, one, prior=PRIOR, t0=0.0)
+        np.testing.assert_allclose(got.mean[k], wanted.mean, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(got.cov[k], wanted.cov, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(got.final_state.mean[k], wanted.final_state.mean, atol=1e-12)
+
+
+def test_raw_and_typed_keys_are_split_over_the_runs():
+    estimator = ej.ensemble(MODEL, 8)
+    batch = ej.Measurement(
+        np.arange(3.0), np.zeros((2, 3, 2)), np.zeros(3, int), np.ones((3, 2)) > 0
+    )
+    raw, typed = jax.random.PRNGKey(4), jax.random.key(4)
+    a, b, c = (
+        ej.run_batch(estimator, {"q": 1.0}, batch, prior=PRIOR, t0=0.0, key=key).mean
+        for key in (raw, typed, jax.random.split(typed, 2))
+    )
+    np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(b, c)
+    assert np.any(np.asarray(b[0]) != np.asarray(b[1]))
