@@ -10,7 +10,7 @@ demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
 
 test: $(DEV)  ## all tests, on all cores
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -1,4 +1,5 @@
-"""Figs. 1-3 of Yoder et al.: what an old measurement still weighs when they come irregularly."""
+"""Figs. 1-3 of Yoder et al.: what an old measurement still weighs when they come irregularly; and
+what the one-step methods make of it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from ewif_jax.scenarios.delays import poisson_times
 from ewif_jax.study import gains_figures as figures
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.late import mean_of
+from ewif_jax.study.late_loss import losses
 
 SETTLING = 400
 AGES = (0, 1, 2, 4, 8)
@@ -97,6 +99,13 @@ def run(experiment: Experiment) -> None:
         "gains", f"Gain of old measurements, {runs} Poisson sequences", rows,
         ["ratio: logarithm of actual over closed form at the actual age, averaged.",
          "fresh: average gain of the newest measurement, and the closed form's."],
+    )  # fmt: skip
+    with experiment.timed("one late measurement"):
+        lost = losses()
+    experiment.table(
+        "late_loss", "One late measurement: expected mean square error over the exact one", lost,
+        ["Position, settled filter, q = r = 1, a measurement every second; the late one is of the",
+         "middle of an interval. a1 and b1 take nothing from more than one update time back."],
     )  # fmt: skip
     experiment.finish()
 

@@ -10,7 +10,7 @@ from ewif_jax.study.late import history_needed, mean_of, paired, rmse
 from ewif_jax.types import Measurement
 
 FILES = {
-    "gains": {"fig1.png", "fig2.png", "fig3.png"},
+    "gains": {"fig1.png", "fig2.png", "fig3.png", "late_loss.csv"},
     "random-walk": {"fig4.png", "fig5.png", "fig6.png", "cutoff.csv", "delays.csv"},
     "arrowhead": {"path.png", "cutoff.png", "lag.png", "cutoffs.csv"},
     "arrowhead-ekf": {"fig10.png"},
