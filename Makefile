@@ -4,13 +4,16 @@ BIN := .venv/bin
 STUDY := .venv/.study
 DEV := .venv/.dev
 
-.PHONY: demo test lint types check bench reproduce clean
+.PHONY: demo test test-all lint types check bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
 
 test: $(DEV)  ## all tests, on all cores
 	$(BIN)/python -m pytest -n auto --dist loadgroup
+
+test-all: $(DEV)  ## the slow ones too
+	$(BIN)/python -m pytest -n auto --dist loadgroup --all
 
 lint: $(DEV)
 	$(BIN)/ruff check .

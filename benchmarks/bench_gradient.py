@@ -13,12 +13,13 @@ import ewif_jax as ej
 from benchmarks import ours
 from benchmarks.timing import measure, report
 from benchmarks.workloads import constant_acceleration
+from ewif_jax.tuning import value_and_gradient
 
 OUTPUT = Path(__file__).parent / "results" / "gradient.json"
 
 
 def main() -> None:
-    """Time forward pass, reverse mode and forward mode for (q, r) and for tau."""
+    """Time forward pass, and gradients as `tune` takes them and in reverse mode."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=1000)
@@ -31,20 +32,24 @@ def main() -> None:
     prior = ej.Gaussian(workload.prior_mean, workload.prior_cov)
     cases = {
         "kalman": (ej.kalman(model), {"q": jnp.float32(0.01), "r": jnp.float32(1.0)}, "q"),
-        "ewif": (ej.ewif(model, lambda p: p["tau"]), {"tau": jnp.float32(1.0)}, "tau"),
+        "ewif": (
+            ej.ewif(model, lambda p: p["tau"]),
+            {"tau": jnp.float32(1.0), "r": jnp.float32(1.0)},
+            "tau",
+        ),
     }
     results = []
     for name, (estimator, params, single) in cases.items():
-        params = {"r": jnp.float32(1.0)} | params
         loss = ej.rmse_loss(
             estimator, ours.stream(workload), workload.truth[..., :2], prior=prior, t0=0.0
         )
         rows = {
             "forward": loss,
-            "reverse mode, all": jax.value_and_grad(loss),
-            "forward mode, one": lambda p, loss=loss, single=single: jax.jvp(
-                lambda x: loss(p | {single: x}), (p[single],), (jnp.ones_like(p[single]),)
+            "value and gradient, one": lambda p, loss=loss, single=single: value_and_gradient(
+                lambda x: loss(p | x), {single: p[single]}
             ),
+            "value and gradient, all": lambda p, loss=loss: value_and_gradient(loss, p),
+            "reverse mode, all": jax.value_and_grad(loss),
         }
         for label, fn in rows.items():
             compiled = jax.jit(fn)

@@ -24,6 +24,11 @@ ESTIMATORS = {
     "al1": "ej.al1(model, 10)",
     "asd": "ej.asd(model, 10)",
     "replay": "ej.replay(ej.kalman(model), 10)",
+    "unscented": "ej.unscented(model)",
+    "ensemble": "ej.ensemble(model, 100)",
+    "enkf2": "ej.enkf2(model, 100, 10)",
+    "bootstrap": "ej.bootstrap(model, 1000)",
+    "pf_fixed_point": "ej.pf_fixed_point(model, 1000, 10)",
 }
 IMPORT = """
 import time
@@ -43,9 +48,10 @@ model = ej.models.constant_velocity(sensors=sensor, q=1.0, dims=2)
 stream = ej.stream(np.arange(50.0, dtype=np.float32), np.zeros((50, 2), np.float32))
 prior = ej.Gaussian(np.zeros(4, np.float32), np.eye(4, dtype=np.float32))
 jax.block_until_ready(jax.numpy.zeros(3) + 1)
+key = jax.random.key(0)
 estimator = {estimator}
 start = time.perf_counter()
-jax.block_until_ready(ej.run(estimator, None, stream, prior=prior, t0=0.0))
+jax.block_until_ready(ej.run(estimator, None, stream, prior=prior, t0=0.0, key=key))
 print(time.perf_counter() - start)
 """
 

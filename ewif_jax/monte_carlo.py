@@ -25,6 +25,9 @@ class Simulation(NamedTuple):
     times: Array | None = None
 
 
+RUN_STEPS = 2**20
+
+
 class Scenario(NamedTuple):
     """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
     start (prior, t0), and the clock of `run`."""
@@ -82,8 +85,9 @@ def monte_carlo(
         runs: how many.
         key: PRNG key; run i depends on it and on i alone, not on `chunk` or `devices`.
         metrics: scores by name (`ewif_jax.scores`); default {"squared_error": squared_error}.
-        chunk: how many runs are in memory at once (default 1024): memory grows with it and not
-            with `runs`; only scores of a chunk are kept, never its trajectories.
+        chunk: how many runs are in memory at once (default: at most 1024, and about a million
+            arrivals together, so that memory grows neither with `runs` nor with the steps of a
+            run); only scores of a chunk are kept, never its trajectories.
         params_per_run: True, False, or a pytree prefix of `params` of these.
         devices: how many local devices share a chunk (default all that divide it).
         progress: called with (runs done, runs) after each chunk.
@@ -92,8 +96,12 @@ def monte_carlo(
         ValueError: runs < 2, chunk < 1, a missing key, or what `run` refuses.
     """
     runs = checks.whole("runs", runs, 2)
-    chunk = min(checks.whole("chunk", 1024 if chunk is None else chunk, 1), runs)
     checks.needs_key(key, "monte_carlo")
+    if chunk is None:
+        steps = jax.eval_shape(scenario.simulate, key).measurements.value.shape[0]
+        parts = -(-runs // min(1024, max(RUN_STEPS // steps, 1)))
+        chunk = -(-runs // parts)
+    chunk = min(checks.whole("chunk", chunk, 1), runs)
     metrics = dict(metrics or {"squared_error": squared_error})
     marked = broadcast_prefix(params_per_run, params)
     for leaf, per_run in zip(jax.tree.leaves(params), jax.tree.leaves(marked), strict=True):
@@ -106,7 +114,9 @@ def monte_carlo(
     missing: list[dict[str, np.ndarray]] = []
     moments: Any = None
     for begin in range(0, runs, chunk):
-        index = jnp.arange(begin, min(begin + chunk, runs))
+        count = min(chunk, runs - begin)
+        # Filled up with repetitions, so that the last chunk is not compiled again.
+        index = jnp.minimum(jnp.arange(begin, begin + chunk), runs - 1)
         some = jax.tree.map(lambda x, f, i=index: x[i] if f else x, params, marked)
         keys = run_keys(index)
         simulation = simulate_batch(scenario, keys)
@@ -124,12 +134,13 @@ def monte_carlo(
             params_per_run=params_per_run,
             devices=devices,
         )
+        values = {name: x[:count] for name, x in values.items()}
         runwise, absent, sums = jax.device_get(_summarise(values))
         per_run.append(runwise)
         missing.append(absent)
         moments = sums if moments is None else jax.tree.map(np.add, moments, sums)
         if progress is not None:
-            progress(min(begin + chunk, runs), runs)
+            progress(begin + count, runs)
     per_step, per_step_se = {}, {}
     for name, (count, total, square) in moments.items():
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -23,12 +23,30 @@ settings.register_profile(
 settings.load_profile("few")
 
 
-def pytest_collection_modifyitems(items):
-    """With `--dist loadgroup`, tests that share what they compile run in one process: those of a
-    file, or in tests/contracts those of an estimator. Studies share nothing."""
+def pytest_addoption(parser):
+    parser.addoption("--all", action="store_true", help="also what is slow and covered otherwise")
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leaves out what is slow and covered otherwise, unless `--all`. With `--dist loadgroup`, tests
+    that share what they compile run in one process: those of a file, or in tests/contracts those of
+    an estimator. Studies share nothing."""
+    if not config.getoption("--all"):
+        left_out = [item for item in items if _slow(item)]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not _slow(item)]
     for item in items:
         room = Path(item.fspath).parent.name
         row = getattr(item, "callspec", None) and item.callspec.params.get("row")
         if room != "study":
             name = f"{room}-{row.name}" if row is not None else str(item.fspath)
             item.add_marker(pytest.mark.xdist_group(name))
+
+
+def _slow(item):
+    row = getattr(item, "callspec", None) and item.callspec.params.get("row")
+    return item.get_closest_marker("slow") is not None or getattr(row, "variant", False)

@@ -64,7 +64,8 @@ class Row(NamedTuple):
     """name; build(model) -> Estimator; late: the status of a late measurement;
     any_age: late measurements of any age are used; accepts_no_prior; needs_key: draws random
     numbers; differentiable in `params`; predicts_back: predict to an earlier time is a number, not
-    NaN; refuses: who refuses a missing prior (default the name)."""
+    NaN; refuses: who refuses a missing prior (default the name); variant: the code of another row
+    with another setting, checked with `--all` only."""
 
     name: str
     build: Callable[[Model], Estimator]
@@ -75,6 +76,7 @@ class Row(NamedTuple):
     differentiable: bool = True
     predicts_back: bool = False
     refuses: str | None = None
+    variant: bool = False
 
 
 def of(name: str) -> Callable[[Any], Any]:
@@ -122,6 +124,7 @@ ROWS = (
         lambda model: enkf2(model, 20, LAG),
         late=Status.LATE_USED,
         needs_key=True,
+        variant=True,
     ),
     Row(
         "enkf2_shared",
@@ -135,10 +138,10 @@ ROWS = (
         lambda model: rts_reference(model, LAG),
         late=Status.LATE_USED,
     ),
-    Row("a1", a1, late=Status.LATE_USED),
-    Row("b1", b1, late=Status.LATE_USED),
+    Row("a1", a1, late=Status.LATE_USED, variant=True),
+    Row("b1", b1, late=Status.LATE_USED, variant=True),
     Row("al1", lambda model: al1(model, LAG), late=Status.LATE_USED),
-    Row("bl1", lambda model: bl1(model, LAG), late=Status.LATE_USED),
+    Row("bl1", lambda model: bl1(model, LAG), late=Status.LATE_USED, variant=True),
     Row("asd", lambda model: asd(model, LAG), late=Status.LATE_USED),
     Row(
         "replay",
@@ -183,6 +186,7 @@ ROWS = (
             needs_key=True,
             differentiable=False,
             refuses="pf_fixed_point",
+            variant=smoother == "uks",
         )
         for smoother in ("eks", "uks", "ps")
     ),

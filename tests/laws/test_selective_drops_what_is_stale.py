@@ -53,44 +53,53 @@ def test_ewif_can_be_gated_too():
     np.testing.assert_allclose(dropped.mean[-1], in_order.mean[-1], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["al1", "ewif"])
+def build(name, model, lag=12):
+    return {
+        "al1": lambda: al1(model, lag),
+        "asd": lambda: asd(model, lag),
+        "ewif": lambda: ej.ewif(model, tau=2.0),
+    }[name]()
+
+
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
 def test_a_soft_gate_is_a_noisier_measurement(name):
-    """Mean and covariance: S / g. Information: R / g."""
+    """Means and covariance: S / g. Information: R / g."""
     given = problem(42, 2, 1)
     table = jnp.asarray(given.R)
-    times = np.array([1.0, 2.0, 1.5])
+    times = np.array([1.0, 2.0, 1.5, 1.2, 2.5])
     data = stream(given, np.random.default_rng(1), times)
 
-    def build(scale):
+    def method(scale):
         def R(params, sensor, t):
             return table[sensor] + jnp.where(t == 1.5, scale, 0.0)
 
-        model = given.model._replace(measurement_cov=R)
-        return al1(model, 2) if name == "al1" else ej.ewif(model, tau=2.0)
+        return build(name, given.model._replace(measurement_cov=R), lag=3)
 
     options = {"prior": given.prior, "t0": 0.0}
-    plain = ej.run(build(0.0), None, data, **options)
-    soft = ej.run(selective(build(0.0), 0.6, softness=0.2), None, data, **options)
+    plain = ej.run(method(0.0), None, data, **options)
+    soft = ej.run(selective(method(0.0), 0.6, softness=0.2), None, data, **options)
     g = 1 / (1 + np.exp(-(0.6 - 0.5) / 0.2))
     R = given.R[int(data.sensor[2]), 0, 0]
-    spread = plain.info.innovation_cov[2, 0, 0] if name == "al1" else R
-    expected = ej.run(build((1 / g - 1) * spread), None, data, **options)
+    spread = plain.info.innovation_cov[2, 0, 0] if name != "ewif" else R
+    expected = ej.run(method((1 / g - 1) * spread), None, data, **options)
     np.testing.assert_allclose(soft.mean[2], expected.mean[2], rtol=1e-10)
     np.testing.assert_allclose(soft.cov[2], expected.cov[2], rtol=1e-10)
     np.testing.assert_allclose(soft.info.log_likelihood[2], g * plain.info.log_likelihood[2])
     np.testing.assert_allclose(soft.mean[:2], plain.mean[:2], atol=1e-14)
 
 
-def test_a_soft_gate_hardens():
-    method = al1(GIVEN.model, 12)
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
+def test_a_soft_gate_hardens(name):
+    method = build(name, GIVEN.model)
     hard = go(selective(method, 1.1))
     soft = go(selective(method, 1.1, softness=1e-3))
     np.testing.assert_allclose(soft.mean, hard.mean, atol=1e-12)
+    np.testing.assert_allclose(soft.cov, hard.cov, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["al1", "ewif"])
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
 def test_the_cut_off_has_a_gradient(name):
-    method = al1(GIVEN.model, 12) if name == "al1" else ej.ewif(GIVEN.model, tau=2.0)
+    method = build(name, GIVEN.model)
     gated = selective(method, lambda p: p[0], softness=lambda p: p[1])
 
     def loss(params):
@@ -110,8 +119,8 @@ def test_what_is_refused():
         selective(method, -1.0)
     with pytest.raises(ValueError, match="softness: expected a positive number"):
         selective(method, 1.0, softness=0.0)
-    with pytest.raises(ValueError, match="softness: expected an estimator with a mean"):
-        go(selective(asd(GIVEN.model, 3), 1.0, softness=0.1))
+    with pytest.raises(ValueError, match="softness: expected an estimator with means"):
+        go(selective(ej.replay(ej.kalman(GIVEN.model), 3), 1.0, softness=0.1))
     for wrapper in (drop_late, lambda e: selective(e, 1.0)):
         with pytest.raises(ValueError, match="estimator: expected an Estimator"):
             wrapper(GIVEN.model)
