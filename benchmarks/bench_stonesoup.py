@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, help="512, or 64 with --quick")
     parser.add_argument("--steps", type=int, help="500, or 100 with --quick")
-    parser.add_argument("--chunk", type=int, default=64, help="runs in one batch")
+    parser.add_argument("--chunk", type=int, default=256, help="runs in one batch")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--output", type=Path, default=OUTPUT)

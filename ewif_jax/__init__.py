@@ -29,7 +29,8 @@ from ewif_jax.analysis.merit import (
     steady_state_gain,
 )
 from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
-from ewif_jax.analysis.storage import storage
+from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
+from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
 from ewif_jax.estimator import run, step, stream
@@ -98,6 +99,7 @@ __all__ = [
     "Simulation",
     "Statistics",
     "Status",
+    "Storage",
     "Trace",
     "Transform",
     "Tuned",
@@ -167,6 +169,8 @@ __all__ = [
     "scores",
     "selective",
     "simulate_batch",
+    "spectral_abscissa",
+    "spectral_radius",
     "square_root",
     "steady_state",
     "steady_state_continuous",

@@ -23,6 +23,7 @@ from ewif_jax.layout import (
     first_run,
     group_size,
     in_groups,
+    on_devices,
     over_devices,
     runs_adjacent,
     runs_first,
@@ -97,15 +98,9 @@ def run_batch(
         broadcast_prefix(context_per_run, context),
     )
     keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
-    return _run_batch(
-        estimator,
-        (*inputs, keys, context),
-        t0,
-        Frozen(flags),
-        clock,
-        observe,
-        device_count(runs, devices),
-    )
+    count = device_count(runs, devices)
+    inputs = on_devices((*inputs, keys, context), flags, count)
+    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count)
 
 
 def _one_for_each(key: Any) -> bool:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.extend.core import Literal
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ewif_jax import checks
 from ewif_jax.kernels.batched import contiguous, turned
@@ -178,10 +178,27 @@ def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable
     go in, and of all that come out."""
     if devices == 1:
         return fn
-    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
     split, shared = PartitionSpec("runs"), PartitionSpec()
     specs = jax.tree.map(lambda f: split if f else shared, flags)
+    mesh = _mesh(devices)
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
+
+
+def on_devices(tree: Any, flags: Any, devices: int) -> Any:
+    """The known leaves put where `over_devices` wants them, wherever they were."""
+    if devices == 1:
+        return tree
+
+    def put(x: Any, flag: bool) -> Any:
+        spec = PartitionSpec("runs") if flag else PartitionSpec()
+        known = not isinstance(x, jax.core.Tracer)
+        return jax.device_put(x, NamedSharding(_mesh(devices), spec)) if known else x
+
+    return jax.tree.map(put, tree, flags)
+
+
+def _mesh(devices: int) -> Mesh:
+    return Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
 
 
 def device_count(runs: int, devices: int | None) -> int:

@@ -1,6 +1,8 @@
 """Strict numerics for every test: float64 by default, no silent rank promotion; and a few, always
 the same, random examples for every law."""
 
+import gc
+import itertools
 import sys
 from pathlib import Path
 
@@ -21,6 +23,19 @@ settings.register_profile(
     phases=(Phase.explicit, Phase.generate),
 )
 settings.load_profile("few")
+
+MAPS = Path("/proc/self/maps")
+_tests = itertools.count(1)
+
+
+@pytest.fixture(autouse=True)
+def _room_for_compiled_programs():
+    """Every compiled program takes memory maps, of which a Linux process may have 65,530 by
+    default; beyond, the compiler crashes."""
+    yield
+    if next(_tests) % 8 == 0 and MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 def pytest_addoption(parser):

@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
-from ewif_jax.continuous.kalman_bucy import matrices, solve, split
+from ewif_jax.continuous.kalman_bucy import matrices, need_diffrax, solve, split
 from ewif_jax.kernels import symmetric
 
 
@@ -50,8 +50,13 @@ def actual_error_continuous(
             design (then the error does not depend on the state).
         rtol, atol, max_steps: of the solver, as in `kalman_bucy`.
 
+    Raises:
+        ValueError: shapes, or a cov0 that is not a covariance.
+        ImportError: diffrax is not installed.
+
     Reduces to: E = Pi for alpha = 0 and a true design; P <= E <= Pi (4-11) otherwise.
     """
+    need_diffrax()
     checks.psd("cov0", cov0)
     checks.shape("times", times, ("K",))
     cov0 = jnp.asarray(cov0)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import jax
@@ -72,6 +73,7 @@ def kalman_bucy(
 
     Deviations: alpha may vary with time, as the paper allows after (2-8).
     """
+    need_diffrax()
     checks.prior(checks.needs_prior(prior, "kalman_bucy"))
     _check_times(signal, times)
     if not callable(fading_rate):
@@ -131,6 +133,14 @@ class Instant(NamedTuple):
         return moved + moved.T + 2 * self.fading_rate * cov - K @ self.R @ K.T + self.noise
 
 
+def need_diffrax() -> None:
+    """Says what to install before anything is traced."""
+    if find_spec("diffrax") is None:
+        raise ImportError(
+            "continuous-time filters need diffrax: pip install 'ewif_jax[continuous]'"
+        )
+
+
 def split(values: tuple, dtype: Any) -> tuple[tuple, tuple]:
     """The functions among `values` (None elsewhere), and the constants (None elsewhere)."""
     functions = tuple(x if callable(x) else None for x in values)
@@ -161,12 +171,8 @@ def solve(
 ) -> Any:
     """The solution of d state / dt = field(t, state) at `times`, stacked, from `start` at the
     first of them. The solver steps exactly to `times` and to `kinks` of the field."""
-    try:
-        import diffrax
-    except ImportError as missing:
-        raise ImportError(
-            "continuous-time filters need diffrax: pip install 'ewif_jax[continuous]'"
-        ) from missing
+    import diffrax
+
     double = times.dtype == jnp.float64
     tolerances = diffrax.PIDController(
         rtol=rtol or (1e-9 if double else 1e-5), atol=atol or (1e-11 if double else 1e-7)

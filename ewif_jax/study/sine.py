@@ -18,7 +18,7 @@ from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.information import information
 from ewif_jax.monte_carlo import monte_carlo, simulate_batch
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
-from ewif_jax.study import sine_figures
+from ewif_jax.study import sine_figures, two_sided
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.folder import Arrays
 from ewif_jax.tuning import rmse_loss, tune
@@ -27,6 +27,8 @@ from ewif_jax.types import Estimator
 DT, VARIANCE = 0.1, 0.5
 PUBLISHED_TAU, PUBLISHED_NOISE = 0.5, 0.1
 BLOCK = 16
+BEHIND = 5
+"""samples of the fixed lag"""
 SETTINGS = ("published", "tuned on samples", "exact optimum")
 
 
@@ -109,8 +111,29 @@ def run(experiment: Experiment) -> None:
     experiment.figure("rmse", sine_figures.curves(found))
     experiment.figure("tuning", sine_figures.histories(found))
     runs = experiment.size(10_000, 500)
+    _smoothers(experiment)
     experiment.table("sine", f"Sine: {runs} runs of 101 samples, RMSE in m", rows, notes)
     experiment.finish()
+
+
+def _smoothers(experiment: Experiment) -> None:
+    """A table of the filter, its fixed lag and the two-sided estimate."""
+    runs = experiment.size(2000, 200)
+    taus = np.asarray([0.2, 0.3, 0.4, PUBLISHED_TAU, 0.6, 0.8, 1.0, 1.3])
+
+    def compute() -> dict[str, Any]:
+        with experiment.timed("smoothers"):
+            batch = simulate_batch(
+                sine(dt=DT, r=VARIANCE), jax.random.split(experiment.key(4), runs)
+            )
+            return two_sided.compared(sine_model(VARIANCE), taus, batch, steps=BEHIND)
+
+    experiment.table(
+        "smoothers", f"EWIF, filtering and smoothing: {runs} runs, RMSE in m",
+        two_sided.rows(experiment.piece("smoothers", compute), taus, list(taus).index(0.5)),
+        [f"fixed lag: {BEHIND * DT:g} s. two-sided: all the samples of the run. above: run by run,",
+         "best tau. Scored at the times that all three report."],
+    )  # fmt: skip
 
 
 def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
     estimator = ej.kalman(MODEL)
     got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
     for k in (0, 17, 31):
-        one = jax.tree.map(lambda x: x[k] if x.ndim > 1 and len(x) == runs else x, batch)
+        one = jax.tree.map(lambda x, k=k: x[k] if x.ndim > 1 and len(x) == runs else x, batch)
         wanted = ej.run(estimator, {"q": q[k]}, one, prior=PRIOR, t0=0.0)
         np.testing.assert_allclose(got.mean[k], wanted.mean, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(got.cov[k], wanted.cov, rtol=1e-10, atol=1e-12)

@@ -14,7 +14,7 @@ FILES = {
     "random-walk": {"fig4.png", "fig5.png", "fig6.png", "cutoff.csv", "delays.csv"},
     "arrowhead": {"path.png", "cutoff.png", "lag.png", "cutoffs.csv"},
     "arrowhead-ekf": {"fig10.png"},
-    "arbitrary-target": {"fig2.png", "animation.gif"},
+    "arbitrary-target": {"fig2.png", "animation.gif", "smoothers.csv"},
     "tuning-under-delay": {"landscape.png", "descent.png"},
 }
 
