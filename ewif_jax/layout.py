@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 from jax.extend.core import Literal
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -191,7 +192,7 @@ def on_devices(tree: Any, flags: Any, devices: int) -> Any:
 
     def put(x: Any, flag: bool) -> Any:
         spec = PartitionSpec("runs") if flag else PartitionSpec()
-        known = not isinstance(x, jax.core.Tracer)
+        known = not isinstance(x, Tracer)
         return jax.device_put(x, NamedSharding(_mesh(devices), spec)) if known else x
 
     return jax.tree.map(put, tree, flags)
