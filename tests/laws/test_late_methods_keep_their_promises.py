@@ -45,6 +45,7 @@ def data(times, dtype=np.float64):
 LATE = data([0.0, 0.5, 1.0, 0.8, 1.0, 2.0, 1.2, 0.7, 1.9, 3.0, 2.5])
 
 
+@pytest.mark.slow  # the contracts say it of every estimator
 @each
 def test_gradients_equal_finite_differences(method):
     names = sorted(PARAMS)
@@ -120,6 +121,7 @@ def test_a_step_traces_once_and_keeps_its_type(method, dtype):
     assert state.time.dtype == dtype
 
 
+@pytest.mark.slow  # the contracts say it of every estimator
 @each
 def test_float32_is_close_to_float64(method):
     def trace(dtype):
