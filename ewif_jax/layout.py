@@ -116,7 +116,7 @@ def scan_in_blocks(
     if block == steps:
         state, seen = lax.scan(step, state, arrivals)
         return finish(seen), state
-    arrivals = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), arrivals)
+    arrivals = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), arrivals)
 
     @partial(jax.checkpoint, prevent_cse=False)
     def several(state: Any, arrivals: Any) -> tuple[Any, Any]:
@@ -164,7 +164,10 @@ def in_groups(fn: Callable[[Any], Any], inputs: Any, flags: Any, runs: int, size
         return fn(inputs)
     leaves, tree = jax.tree.flatten(inputs)
     marked = jax.tree.leaves(flags)
-    split = [x.reshape(-1, size, *x.shape[1:]) for x, f in zip(leaves, marked, strict=True) if f]
+    groups = runs // size
+    split = [
+        x.reshape(groups, size, *x.shape[1:]) for x, f in zip(leaves, marked, strict=True) if f
+    ]
 
     def one(group: list[Array]) -> Any:
         some = iter(group)

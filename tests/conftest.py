@@ -57,7 +57,7 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         room = Path(item.fspath).parent.name
         row = getattr(item, "callspec", None) and item.callspec.params.get("row")
-        if room != "study":
+        if room != "study" and config.pluginmanager.hasplugin("xdist"):
             name = f"{room}-{row.name}" if row is not None else str(item.fspath)
             item.add_marker(pytest.mark.xdist_group(name))
 

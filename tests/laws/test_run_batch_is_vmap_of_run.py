@@ -7,6 +7,8 @@ import pytest
 
 import ewif_jax as ej
 from ewif_jax import layout
+from ewif_jax import scores as scores_of
+from ewif_jax.scores import scored
 
 RUNS, STEPS = 5, 12
 SENSORS = [ej.models.position_sensor(r, dims=2) for r in (0.5, 2.0)]
@@ -76,6 +78,11 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
         np.testing.assert_allclose(got.mean[k], wanted.mean, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(got.cov[k], wanted.cov, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(got.final_state.mean[k], wanted.final_state.mean, atol=1e-12)
+    scores = {"score": scores_of.squared_innovation}  # without a truth, which is then of width 0
+    found = scored(
+        estimator, {"q": q}, batch, scores=scores, prior=PRIOR, t0=0.0, params_per_run=True
+    )["score"]
+    np.testing.assert_allclose(found, np.sum(got.info.innovation**2, -1), rtol=1e-10)
 
 
 def test_raw_and_typed_keys_are_split_over_the_runs():
