@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose, step
+from ewif_jax.forms.partial_use import partly
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -15,13 +16,15 @@ from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 class ReplayState(NamedTuple):
     """time (); current: the estimator's state with everything; base: its state before the buffered
     measurements; buffer: L measurements sorted by time, values padded; evidence (): their joint log
-    likelihood given the base."""
+    likelihood given the base; shares (L+1,): how much of each of them and of the next one is used,
+    or None where that is all."""
 
     time: Array
     current: Any
     base: Any
     buffer: Measurement
     evidence: Array
+    shares: Array | None = None
 
 
 def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
@@ -75,11 +78,14 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         checks.require(size <= width, "width", f"room for {size} components", width)
         if checks.known(measurement.sensor) is not None:  # in the buffer it is not known any more
             jax.eval_shape(lambda: estimator.update(params, state.current, measurement))
-        sorted_in, place = _insert(state.buffer, _padded(measurement, width))
+        shares = state.shares
+        stored, share = (None, None) if shares is None else (shares[:-1], shares[-1])
+        sorted_in, place = _insert((state.buffer, stored), (_padded(measurement, width), share))
 
-        def one(at: Any, entry: Measurement) -> tuple[Any, Info]:
-            cut = entry._replace(value=entry.value[:size], mask=entry.mask[:size])
-            return step(estimator, params, at, cut)
+        def one(at: Any, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
+            measured, share = entry
+            cut = measured._replace(value=measured.value[:size], mask=measured.mask[:size])
+            return step(estimator if share is None else partly(estimator, share), params, at, cut)
 
         oldest, rest = (jax.tree.map(lambda x, k=k: x[k], sorted_in) for k in (0, slice(1, None)))
         base, first = one(state.base, oldest)
@@ -99,7 +105,9 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
             status=jnp.where(used_late, jnp.int32(Status.LATE_USED), info.status),
         )
         evidence = total - infos.log_likelihood[0]
-        updated = ReplayState(state.time, current, base, rest, evidence)
+        buffer, stored = rest
+        shares = None if stored is None else jnp.append(stored, jnp.ones_like(stored[:1]))
+        updated = ReplayState(state.time, current, base, buffer, evidence, shares)
         return choose(known & present, updated, state), too_late(info, ~known)
 
     def estimate(params: Any, state: ReplayState) -> Gaussian:
@@ -115,10 +123,11 @@ def _padded(measurement: Measurement, width: int) -> Measurement:
     )
 
 
-def _insert(buffer: Measurement, new: Measurement) -> tuple[Measurement, Array]:
+def _insert(buffer: tuple[Measurement, Any], new: tuple[Measurement, Any]) -> tuple[Any, Array]:
     """The buffer with `new` after everything not newer, and its place."""
-    place = jnp.sum(buffer.time <= new.time)
-    index = jnp.arange(buffer.time.shape[0] + 1)
+    times = buffer[0].time
+    place = jnp.sum(times <= new[0].time)
+    index = jnp.arange(times.shape[0] + 1)
     source = jnp.where(index < place, index, index - 1)
 
     def put(table: Array, row: Array) -> Array:

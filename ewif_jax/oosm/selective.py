@@ -4,16 +4,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose
-from ewif_jax.forms import information
-from ewif_jax.forms.information import InformationState
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.forms.partial_use import partly, prepared
 from ewif_jax.models import resolve
 from ewif_jax.oosm.history import too_late
-from ewif_jax.types import Estimator, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Estimator:
@@ -40,13 +37,13 @@ def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Est
             * for an information matrix and vector (`ewif`): exactly R / g in place of R.
 
             So a softly gated measurement is a noisier one, and the covariance stays honest. The
-            reported log likelihood is g times the measurement's. States of any other kind are
-            refused: `replay` repeats what it has stored, which has no weight, and particles have
-            no such update.
+            reported log likelihood is g times the measurement's. `replay` stores g with the
+            measurement and does the same in its place, whenever it filters again. States of any
+            other kind are refused: particles have no such update.
 
     Reduces to: `drop_late` for max_delay = 0; the estimator itself for an infinite one; the hard
-        cut-off as softness goes to 0 (with `asd` as long as its past times suffice: a measurement
-        of weight 0 still takes the place of one).
+        cut-off as softness goes to 0 (with `asd` and `replay` as long as their room suffices: a
+        measurement of weight 0 still takes the place of one).
 
     Deviations: Algorithm 2 as printed compares time - lastEstTime, negative for late measurements,
         and lets lastEstTime run backwards; (the estimate's time - the measurement's) is meant, and
@@ -63,55 +60,19 @@ def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Est
     if softness is not None and not callable(softness):
         checks.positive("softness", softness)
 
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> Any:
+        state = estimator.init(params, prior, t0, key)
+        return state if softness is None else prepared(state)
+
     def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
         delay = state.time - measurement.time
         limit = checks.at_least("max_delay", resolve(max_delay, params), 0.0)
-        updated, info = estimator.update(params, state, measurement)
         if softness is None:
+            updated, info = estimator.update(params, state, measurement)
             stale = (delay > 0) & (delay >= limit)
             return choose(stale, state, updated), too_late(info, stale)
         width = checks.positive("softness", resolve(softness, params))
-        weight = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
-        weight = weight.astype(state.time.dtype)
-        info = info._replace(log_likelihood=weight * info.log_likelihood)
-        if hasattr(updated, "means"):
-            return _weakened(estimator, params, state, measurement, weight), info
-        return _mixed(state, updated, weight), info
+        share = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
+        return partly(estimator, share.astype(state.time.dtype)).update(params, state, measurement)
 
-    return estimator._replace(update=update)
-
-
-def _weakened(
-    estimator: Estimator, params: Any, state: Any, measurement: Measurement, weight: Array
-) -> Any:
-    """The joint state with `weight` times the effect of the measurement, not of making room for its
-    time. The gain is the derivative of the new means."""
-
-    def means(value: Array) -> tuple[Array, tuple[Any, Info]]:
-        updated, info = estimator.update(params, state, measurement._replace(value=value))
-        return updated.means.reshape(-1), (updated, info)
-
-    gain, (updated, info) = jax.jacfwd(means, has_aux=True)(measurement.value)
-    back = matvec(gain, info.innovation).reshape(updated.means.shape)
-    spread = matmul(matmul(gain, info.innovation_cov), gain.T)
-    return updated._replace(
-        means=updated.means - (1 - weight) * back, cov=updated.cov + (1 - weight) * spread
-    )
-
-
-def _mixed(old: Any, new: Any, weight: Array) -> Any:
-    """(1 - weight) old + weight new, in what makes up the estimate."""
-    if isinstance(old, InformationState):
-        shifted = new.vector + information.times(new.matrix, new.mean - old.mean)
-        matrix, vector = _mix((old.matrix, old.vector), (new.matrix, shifted), weight)
-        return information.recentred(old._replace(matrix=matrix, vector=vector))
-    plain = hasattr(old, "mean") and hasattr(old, "cov")
-    checks.require(
-        plain, "softness", "an estimator with means and a covariance as state", type(old).__name__
-    )
-    mean, cov = _mix((old.mean, old.cov), (new.mean, new.cov), weight)
-    return new._replace(mean=mean, cov=cov)
-
-
-def _mix(old: Any, new: Any, weight: Array) -> Any:
-    return jax.tree.map(lambda a, b: a + weight * (b - a), old, new)
+    return estimator._replace(init=init, update=update)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from late_streams import problem, stream
 from oracles.late import selective_filter
+from scipy.stats import norm
 
 import ewif_jax as ej
 from ewif_jax.oosm.al1 import al1
@@ -58,10 +59,11 @@ def build(name, model, lag=6):
         "al1": lambda: al1(model, lag),
         "asd": lambda: asd(model, lag),
         "ewif": lambda: ej.ewif(model, tau=2.0),
+        "replay": lambda: ej.replay(ej.kalman(model), lag, width=2),
     }[name]()
 
 
-@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif", "replay"])
 def test_a_soft_gate_is_a_noisier_measurement(name):
     """Means and covariance: S / g. Information: R / g."""
     given = problem(42, 2, 1)
@@ -84,11 +86,15 @@ def test_a_soft_gate_is_a_noisier_measurement(name):
     expected = ej.run(method((1 / g - 1) * spread), None, data, **options)
     np.testing.assert_allclose(soft.mean[2], expected.mean[2], rtol=1e-10)
     np.testing.assert_allclose(soft.cov[2], expected.cov[2], rtol=1e-10)
-    np.testing.assert_allclose(soft.info.log_likelihood[2], g * plain.info.log_likelihood[2])
+    # the share g of its own log likelihood, and all of what `replay` has refiltered
+    in_place = [norm(0, np.sqrt(x.info.innovation_cov[2, 0, 0])) for x in (plain, expected)]
+    whole, noisier = (x.logpdf(plain.info.innovation[2, 0]) for x in in_place)
+    rest = expected.info.log_likelihood[2] - noisier
+    np.testing.assert_allclose(soft.info.log_likelihood[2], g * whole + rest, rtol=1e-9)
     np.testing.assert_allclose(soft.mean[:2], plain.mean[:2], atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif", "replay"])
 def test_a_soft_gate_hardens(name):
     method = build(name, GIVEN.model)
     hard = go(selective(method, 1.1))
@@ -97,7 +103,7 @@ def test_a_soft_gate_hardens(name):
     np.testing.assert_allclose(soft.cov, hard.cov, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["al1", "asd", "ewif"])
+@pytest.mark.parametrize("name", ["al1", "asd", "ewif", "replay"])
 def test_the_cut_off_has_a_gradient(name):
     method = build(name, GIVEN.model)
     gated = selective(method, lambda p: p[0], softness=lambda p: p[1])
@@ -110,7 +116,7 @@ def test_the_cut_off_has_a_gradient(name):
     both = jax.jit(jax.vmap(loss))(at[None] + h * jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
     expected = (both[::2] - both[1::2]) / (2 * h)
     np.testing.assert_allclose(jax.grad(loss)(at), expected, rtol=1e-6)
-    if name != "asd":  # whose program takes long to compile
+    if name not in ("asd", "replay"):  # whose programs take long to compile
         np.testing.assert_allclose(jax.jacfwd(loss)(at), expected, rtol=1e-6)
 
 
@@ -121,7 +127,8 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="softness: expected a positive number"):
         selective(method, 1.0, softness=0.0)
     with pytest.raises(ValueError, match="softness: expected an estimator with means"):
-        go(selective(ej.replay(ej.kalman(GIVEN.model), 3), 1.0, softness=0.1))
+        gated = selective(ej.bootstrap(GIVEN.model, 10), 1.0, softness=0.1)
+        ej.run(gated, None, DATA, prior=GIVEN.prior, t0=0.0, key=jax.random.key(0))
     for wrapper in (drop_late, lambda e: selective(e, 1.0)):
         with pytest.raises(ValueError, match="estimator: expected an Estimator"):
             wrapper(GIVEN.model)

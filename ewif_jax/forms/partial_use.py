@@ -1,0 +1,79 @@
+"""Using a measurement in part: the share g of what it would do to the estimate.
+
+Where the whole measurement moves the mean by K nu and the covariance by -K S K', the share g of it
+does g times as much. That is exactly the update of a measurement whose innovation covariance is
+S / g; for an information matrix and vector, of one whose noise covariance is R / g.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.forms import information
+from ewif_jax.forms.information import InformationState
+from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.types import Estimator, Info, Measurement
+
+
+def prepared(state: Any) -> Any:
+    """A first state with room for the shares of the measurements that it stores, if it does."""
+    if not hasattr(state, "shares"):
+        return state
+    slots = state.buffer.time.shape[0] + 1
+    return state._replace(shares=jnp.ones(slots, state.buffer.time.dtype))
+
+
+def partly(estimator: Estimator, share: Array) -> Estimator:
+    """The estimator that uses `share`, in [0, 1], of every measurement; its log likelihoods are
+    `share` times as large. Its states are `prepared`."""
+
+    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+        if hasattr(state, "shares"):  # stored with the measurement, and used whenever it is
+            marked = state._replace(shares=state.shares.at[-1].set(share))
+            return estimator.update(params, marked, measurement)
+        if hasattr(state, "means"):
+            updated, info = _of_several_times(estimator, params, state, measurement, share)
+        else:
+            updated, info = estimator.update(params, state, measurement)
+            updated = _mixed(state, updated, share)
+        return updated, info._replace(log_likelihood=share * info.log_likelihood)
+
+    return estimator._replace(update=update)
+
+
+def _of_several_times(
+    estimator: Estimator, params: Any, state: Any, measurement: Measurement, share: Array
+) -> tuple[Any, Info]:
+    """The joint state with `share` of the effect of the measurement, not of making room for its
+    time. The gain is the derivative of the new means."""
+
+    def means(value: Array) -> tuple[Array, tuple[Any, Info]]:
+        updated, info = estimator.update(params, state, measurement._replace(value=value))
+        return updated.means.reshape(-1), (updated, info)
+
+    gain, (updated, info) = jax.jacfwd(means, has_aux=True)(measurement.value)
+    back = matvec(gain, info.innovation).reshape(updated.means.shape)
+    spread = matmul(matmul(gain, info.innovation_cov), gain.T)
+    means_then = updated.means - (1 - share) * back
+    return updated._replace(means=means_then, cov=updated.cov + (1 - share) * spread), info
+
+
+def _mixed(old: Any, new: Any, share: Array) -> Any:
+    """(1 - share) old + share new, in what makes up the estimate."""
+    if isinstance(old, InformationState):
+        shifted = new.vector + information.times(new.matrix, new.mean - old.mean)
+        matrix, vector = _mix((old.matrix, old.vector), (new.matrix, shifted), share)
+        return information.recentred(old._replace(matrix=matrix, vector=vector))
+    plain = hasattr(old, "mean") and hasattr(old, "cov")
+    checks.require(
+        plain, "softness", "an estimator with means and a covariance as state", type(old).__name__
+    )
+    mean, cov = _mix((old.mean, old.cov), (new.mean, new.cov), share)
+    return new._replace(mean=mean, cov=cov)
+
+
+def _mix(old: Any, new: Any, share: Array) -> Any:
+    return jax.tree.map(lambda a, b: a + share * (b - a), old, new)
