@@ -7,7 +7,8 @@ The peer is EWIF written straightforwardly: one step with `jnp.linalg`, scanned,
           + e^{-(t_k - t_d)/\tau} A_d' H' R^{-1} H A_d,
 
 with the estimate solved from the information vector at every report. `in sequence` is the same
-data sorted by time: its ratio to the late row is the price of a late update.
+data sorted by time: its ratio to the late row is the price of a late update. `longer delays` are
+drawn ten times as long: no method's cost may depend on them.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from benchmarks.timing import measure, report
 from benchmarks.workloads import L2, irregular_and_late
 
 OUTPUT = Path(__file__).parent / "results" / "late.json"
-PLAIN = "plain vmapped EWIF"
+PLAIN, KALMAN = "plain vmapped EWIF", "drop_late(kalman)"
 TAU = 2.0
 
 
@@ -40,6 +41,7 @@ def main() -> None:
     runs = options.runs or (64 if options.quick else 1024)
     steps = options.steps or (100 if options.quick else 1000)
     late = irregular_and_late(runs, steps)
+    longer = irregular_and_late(runs, steps, mean_delay=3.0)
     ordered = in_sequence(late)
     tau = np.geomspace(TAU / 2, TAU * 2, runs).astype(np.float32)
     ewif, noisy = {"tau": tau}, {"q": late.q}
@@ -48,13 +50,16 @@ def main() -> None:
     def row(estimator, params, workload):
         return ours.batch_filter(estimator, params, workload, per_run=True)
 
-    decay = ej.ewif(model, lambda p: p["tau"])
+    decay, one_step = ej.ewif(model, lambda p: p["tau"]), ej.al1(model, lag)
     filters = {
         PLAIN: partial(plain_ewif, late, tau),
         "ewif": row(decay, ewif, late),
         "ewif, in sequence": row(decay, ewif, ordered),
-        "drop_late(kalman)": row(ej.drop_late(ej.kalman(model)), noisy, late),
-        "al1": row(ej.al1(model, lag), noisy, late),
+        KALMAN: row(ej.drop_late(ej.kalman(model)), noisy, late),
+        "ewif, longer delays": row(decay, ewif, longer),
+        "al1": row(one_step, noisy, late),
+        "al1, longer delays": row(one_step, noisy, longer),
+        "al1, lag 32": row(ej.al1(model, 32), noisy, late),
         "asd": row(ej.asd(model, lag), noisy, late),
         "replay(kalman)": row(ej.replay(ej.kalman(model), lag), noisy, late),
     }
@@ -68,7 +73,7 @@ def main() -> None:
         :, steps // 2 :
     ].max()
     results[1]["note"] = f"largest difference from the plain version {gap:.1e}"
-    report(results, options.output, references=(PLAIN, "ewif, in sequence"))
+    report(results, options.output, references=(PLAIN, "ewif, in sequence", KALMAN))
 
 
 def in_sequence(workload: L2) -> L2:

@@ -32,6 +32,7 @@ from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
 from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
 from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
+from ewif_jax.continuous.error import actual_error_continuous, error_bounds_continuous
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
 from ewif_jax.estimator import run, step, stream
 from ewif_jax.estimators.bootstrap import bootstrap
@@ -105,6 +106,7 @@ __all__ = [
     "Tuned",
     "a1",
     "actual_error",
+    "actual_error_continuous",
     "al1",
     "alpha_beta_eigenvalues",
     "alpha_beta_gains",
@@ -124,6 +126,7 @@ __all__ = [
     "equivalent_process_noise",
     "equivalent_tau",
     "error_bounds",
+    "error_bounds_continuous",
     "ewif",
     "expected_mse",
     "extended",

@@ -1,6 +1,5 @@
 """Running an estimator: one arrival at a time (`step`) or a whole stream (`run`)."""
 
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.compiling import quick_jit
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 Clock = Literal["validity", "arrival"]
@@ -47,7 +47,8 @@ def step(
     """The state after one arrival, and its diagnostics: the body of `run` as a streaming call.
 
     The state moves to the measurement's time unless that is past (then the measurement is late).
-    A measurement whose mask is all False changes nothing.
+    A measurement whose mask is all False changes nothing. One that is not a number (its time, or
+    a present component or its square, is NaN or infinite) changes nothing either: `REJECTED`.
 
     Args:
         estimator: any `Estimator`.
@@ -55,8 +56,14 @@ def step(
         state: from `estimator.init` or an earlier `step`.
         measurement: one arrival: time (), value (m,), sensor (), mask (m,).
     """
-    arrival = advance(estimator, params, state, measurement)
-    return arrival.kept, arrival.info
+    measurement = cast(measurement, state.time.dtype)
+    time, value, _, mask = measurement
+    when = jnp.isfinite(time)
+    good = when & jnp.all(jnp.isfinite(jnp.square(value)))
+    usable = measurement._replace(time=jnp.where(when, time, state.time), mask=mask & good)
+    arrival = advance(estimator, params, state, usable)
+    status = jnp.where(good | ~jnp.any(mask), arrival.info.status, jnp.int32(Status.REJECTED))
+    return arrival.kept, arrival.info._replace(status=status)
 
 
 def run(
@@ -94,7 +101,10 @@ def run(
     """
     measurements = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = _prior(prior, measurements.value.dtype)
-    return _run(estimator, params, measurements, prior, t0, times, clock, key)
+    # What draws random numbers has many members, and fills vectors.
+    wide = key is not None and measurements.time.shape[0] > 100
+    filtered = _run_wide if wide else _run_small
+    return filtered(estimator, params, measurements, prior, t0, times, clock, key)
 
 
 def validated(
@@ -214,9 +224,15 @@ def _in_dtype(x: Any, dtype: Any) -> Any:
     return jnp.asarray(x, dtype) if value is None else value.astype(dtype)
 
 
-def verdict(late: Array, present: Array, late_status: Status | Array = Status.TOO_LATE) -> Array:
-    """The status of an update that has nothing more to say than "late" and "present"."""
+def verdict(
+    late: Array,
+    present: Array,
+    late_status: Status | Array = Status.TOO_LATE,
+    good: Array | bool = True,
+) -> Array:
+    """The status of an update that has nothing more to say than "late", "present" and "good"."""
     status = jnp.where(late, late_status, Status.USED)
+    status = jnp.where(good | (status == Status.TOO_LATE), status, Status.REJECTED)
     return jnp.where(present, status, Status.MASKED).astype(jnp.int32)
 
 
@@ -225,8 +241,7 @@ def choose(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-@partial(jax.jit, static_argnames=("estimator", "clock"))
-def _run(
+def _filtered(
     estimator: Estimator,
     params: Any,
     measurements: Measurement,
@@ -251,3 +266,7 @@ def _run(
 
     state, (time, mean, cov, info) = lax.scan(body, state, (measurements, times))
     return Trace(time, mean, cov, info, state)
+
+
+_run_wide = jax.jit(_filtered, static_argnames=("estimator", "clock"))
+_run_small = quick_jit(_filtered, static_argnames=("estimator", "clock"))

@@ -193,12 +193,22 @@ def on_devices(tree: Any, flags: Any, devices: int) -> Any:
     if devices == 1:
         return tree
 
+    split, shared = (NamedSharding(_mesh(devices), PartitionSpec(*x)) for x in (["runs"], []))
+
     def put(x: Any, flag: bool) -> Any:
-        spec = PartitionSpec("runs") if flag else PartitionSpec()
-        known = not isinstance(x, Tracer)
-        return jax.device_put(x, NamedSharding(_mesh(devices), spec)) if known else x
+        return (
+            x if isinstance(x, Tracer) else jax.device_put(_on_host(x), split if flag else shared)
+        )
 
     return jax.tree.map(put, tree, flags)
+
+
+def _on_host(x: Any) -> Any:
+    """An array of one CPU device as a NumPy view of its memory, which goes to others uncopied."""
+    if not isinstance(x, Array) or _is_key(x):
+        return x
+    here, *others = x.devices()
+    return x if others or here.platform != "cpu" else np.asarray(x)
 
 
 def _mesh(devices: int) -> Mesh:

@@ -39,7 +39,9 @@ class Status(IntEnum):
     TOO_LATE = 2
     """older than the method can use: the estimate is unchanged"""
     REJECTED = 3
-    """refused by a gate or because it would have broken the estimate: unchanged"""
+    """refused by a gate, or because its innovation (in its present components) or log likelihood is
+    not finite: the estimate is unchanged, and what is not finite in its innovation is reported as 0
+    """
     MASKED = 4
     """no component present: unchanged"""
 

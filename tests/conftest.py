@@ -1,12 +1,15 @@
 """Strict numerics for every test: float64 by default, no silent rank promotion; and a few, always
-the same, random examples for every law."""
+the same, random examples for every law. Programs are compiled quickly rather than made fast, but
+with `--all` as for a user."""
 
 import gc
 import itertools
+import os
 import sys
 from pathlib import Path
 
 import jax
+import jaxlib.version
 import pytest
 from hypothesis import Phase, settings
 
@@ -43,6 +46,10 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    if not config.getoption("--all") and jaxlib.version.__version_info__ < (0, 11):
+        # Compiling takes most of the time. A later XLA might not know the flag, and stop.
+        flags = (os.environ.get("XLA_FLAGS", ""), "--xla_cpu_use_fusion_emitters=false")
+        os.environ["XLA_FLAGS"] = " ".join(flags).strip()
     config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
 
 

@@ -14,7 +14,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 RANKS = (
     {"types"},
-    {"checks", "kernels"},
+    {"checks", "compiling", "kernels"},
     {"models", "layout"},
     {"estimator"},
     {"forms", "batch"},

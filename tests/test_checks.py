@@ -12,12 +12,16 @@ from hypothesis import strategies as st
 
 import ewif_jax as ej
 from ewif_jax import Gaussian, Measurement
+from ewif_jax.analysis.anderson import System
+from ewif_jax.analysis.anderson_continuous import ContinuousSystem
+from ewif_jax.continuous.kalman_bucy import Signal
 from ewif_jax.models import (
     bearing_sensor,
     constant_velocity,
     position_sensor,
     random_walk,
 )
+from ewif_jax.scenarios.delays import by_sensor, losses
 
 WORLD = constant_velocity(sensors=[position_sensor(0.5), position_sensor(1.5)], q=0.2)
 KALMAN = ej.kalman(WORLD)
@@ -40,6 +44,9 @@ SQUARE = np.eye(2)
 NOT_SYMMETRIC = np.array([[1.0, 0.5], [0.0, 1.0]])
 NOT_PSD = np.array([[1.0, 2.0], [2.0, 1.0]])
 NAN = np.full((2, 2), np.nan)
+ROW = np.array([[1.0, 0.0]])
+SYSTEM = System(SQUARE, ROW, SQUARE, np.eye(1))
+FLOW = ContinuousSystem(-SQUARE, ROW.T, ROW, np.eye(1), np.eye(1))
 EPOCH = 1.7e9 + np.array([0.0, 0.01, 0.02])
 
 REFUSED = {
@@ -334,7 +341,196 @@ REFUSED = {
         lambda: bearing_sensor(1.0, (0.0, 0.0, 0.0)),
         "position: expected shape (2,), got shape (3,)",
     ),
+    # merit of a late measurement
+    "F not square, for a gain": (
+        lambda: ej.steady_state_gain(np.ones((2, 3)), ROW, SQUARE, 1.0),
+        "F: expected shape (2, 2), got shape (2, 3)",
+    ),
+    "R = 0, for a gain": (
+        lambda: ej.delayed_gain(1.0, 1.0, 1.0, 0.0, 2),
+        "R: expected a positive definite matrix, got smallest eigenvalue 0",
+    ),
+    "NaN in F, for a gain": (
+        lambda: ej.steady_state_gain(np.nan, 1.0, 1.0, 1.0),
+        "F: expected finite numbers, got nan",
+    ),
+    "a negative delay": (
+        lambda: ej.delayed_gain(1.0, 1.0, 1.0, 1.0, -0.5),
+        "steps: expected a number >= 0, got -0.5",
+    ),
+    "a negative interval, for a cut-off": (
+        lambda: ej.cutoff_delay(1.0, 1.0, 1.0, 1.0, interval=-1.0),
+        "interval: expected a positive number, got -1.0",
+    ),
+    "a ratio of 1": (
+        lambda: ej.random_walk_cutoff(1.0, ratio=1.0),
+        "ratio: expected a number between 0 and 1, got 1.0",
+    ),
+    "a negative index": (
+        lambda: ej.alpha_beta_eigenvalues(-1.0),
+        "index: expected a number >= 0.0, got -1.0",
+    ),
+    "a first covariance that is not PSD": (
+        lambda: ej.gain_history(SQUARE[None], ROW, SQUARE[None], np.eye(1), NOT_PSD, 2),
+        "first_cov: expected a positive semidefinite matrix, got smallest eigenvalue -1",
+    ),
+    "one noise that is not PSD, for a gain": (
+        lambda: ej.gain_history(SQUARE[None], ROW, NOT_PSD[None], np.eye(1), SQUARE, 2),
+        "Q[0]: expected a positive semidefinite matrix, got smallest eigenvalue -1",
+    ),
+    # Anderson, discrete
+    "R < 0, weighted": (
+        lambda: weighted(R=-np.eye(1)),
+        "system.R: expected a positive semidefinite matrix, got smallest eigenvalue -1",
+    ),
+    "R[1] < 0, weighted": (
+        lambda: weighted(R=np.array([[[1.0]], [[-2.0]], [[1.0]]])),
+        "system.R[1]: expected a positive semidefinite matrix, got smallest eigenvalue -2",
+    ),
+    "cov0 not PSD, weighted": (
+        lambda: ej.weighted_covariances(SYSTEM, NOT_PSD, fading=1.1, steps=3),
+        "cov0: expected a positive semidefinite matrix, got smallest eigenvalue -1",
+    ),
+    "H of another width, weighted": (
+        lambda: weighted(H=np.ones((1, 3))),
+        "system.H: expected shape (1, 2), got shape (1, 3)",
+    ),
+    "too few matrices, weighted": (
+        lambda: weighted(F=np.stack([SQUARE, SQUARE])),
+        "system.F: expected shape (3, 2, 2), got shape (2, 2, 2)",
+    ),
+    "no steps, weighted": (
+        lambda: ej.weighted_covariances(SYSTEM, SQUARE, fading=1.1, steps=0),
+        "steps: expected a whole number >= 1, got 0",
+    ),
+    "fading of another length": (
+        lambda: ej.weighted_covariances(SYSTEM, SQUARE, fading=np.ones(2), steps=3),
+        "fading: expected shape (3,), got shape (2,)",
+    ),
+    "cov0 not PSD, bounds": (
+        lambda: ej.error_bounds(SYSTEM, NOT_PSD, fading=1.1, steps=3),
+        "cov0: expected a positive semidefinite matrix",
+    ),
+    "a gain of another size": (
+        lambda: ej.actual_error(np.ones((3, 3, 1)), SYSTEM, SQUARE),
+        "cov0: expected shape (3, 3), got shape (2, 2)",
+    ),
+    "a design of another size": (
+        lambda: ej.actual_error(
+            np.ones((3, 2, 1)), SYSTEM, SQUARE, design=SYSTEM._replace(H=np.ones((2, 2)))
+        ),
+        "design.H: expected shape (1, 2), got shape (2, 2)",
+    ),
+    "a steady state of a sequence": (
+        lambda: ej.steady_state(SYSTEM._replace(F=SQUARE[None])),
+        "system.F: expected shape (1, 1), got shape (1, 2, 2)",
+    ),
+    "R = 0, steady": (
+        lambda: ej.steady_state(SYSTEM._replace(R=np.zeros((1, 1)))),
+        "system.R: expected a positive definite matrix, got smallest eigenvalue 0",
+    ),
+    "fading < 1, as noise": (
+        lambda: ej.weighting_as_process_noise(SQUARE, SQUARE, SQUARE, 0.9),
+        "fading: expected a number >= 1.0, got 0.9",
+    ),
+    "a covariance that is not one, as noise": (
+        lambda: ej.weighting_as_process_noise(SQUARE, SQUARE, NOT_PSD, 1.1),
+        "cov: expected a positive semidefinite matrix",
+    ),
+    # Anderson, continuous
+    "a rate < 0, as noise": (
+        lambda: ej.weighting_as_input_noise(SQUARE, SQUARE, -0.1),
+        "fading_rate: expected a number >= 0.0, got -0.1",
+    ),
+    "noise of another size, as noise": (
+        lambda: ej.weighting_as_input_noise(np.eye(3), SQUARE, 0.1),
+        "noise: expected shape (2, 2), got shape (3, 3)",
+    ),
+    "R < 0, steady and continuous": (
+        lambda: ej.steady_state_continuous(FLOW._replace(R=-np.eye(1))),
+        "system.R: expected a positive definite matrix, got smallest eigenvalue -1",
+    ),
+    "a function, steady and continuous": (
+        lambda: ej.steady_state_continuous(FLOW._replace(F=lambda p, t: SQUARE)),
+        "system.F: expected a constant matrix, got a function",
+    ),
+    "F of another size, continuous": (
+        lambda: bucy(F=np.eye(3)),
+        "system.F: expected shape (2, 2), got shape (3, 3)",
+    ),
+    "F from a function, of another size": (
+        lambda: bucy(F=lambda p, t: jnp.eye(3)),
+        "system.F: expected shape (2, 2), got shape (3, 3)",
+    ),
+    "H of other measurements than the signal": (
+        lambda: bucy(H=SQUARE, R=SQUARE),
+        "system.H: expected shape (1, 2), got shape (2, 2)",
+    ),
+    "Q of another size than G": (
+        lambda: bucy(Q=SQUARE),
+        "system.Q: expected shape (1, 1), got shape (2, 2)",
+    ),
+    "R < 0, continuous": (
+        lambda: bucy(R=np.array([[-0.5]])),
+        "system.R: expected a positive definite matrix, got smallest eigenvalue -0.5",
+    ),
+    "R < 0 from a function at the start": (
+        lambda: bucy(R=lambda p, t: -jnp.eye(1)),
+        "system.R: expected a positive definite matrix, got smallest eigenvalue -1",
+    ),
+    "R a number, continuous": (
+        lambda: bucy(R=0.5),
+        "system.R: expected shape (., .), got shape ()",
+    ),
+    "a rate < 0 from a function at the start": (
+        lambda: bucy(fading_rate=lambda p, t: jnp.asarray(-0.25)),
+        "fading_rate: expected a number >= 0.0, got -0.25",
+    ),
+    "NaN in a signal": (
+        lambda: bucy(signal=Signal(np.array([0.0, 1.0]), np.array([[0.0], [np.nan]]))),
+        "signal.value: expected finite numbers, got nan at index (1, 0)",
+    ),
+    "no tolerance": (lambda: bucy(rtol=0.0), "rtol: expected a positive number, got 0.0"),
+    "cov0 not PSD, continuous": (
+        lambda: ej.actual_error_continuous(FLOW, None, NOT_PSD, times=[0.0, 1.0]),
+        "cov0: expected a positive semidefinite matrix, got smallest eigenvalue -1",
+    ),
+    "a truth of another size": (
+        lambda: ej.actual_error_continuous(
+            FLOW, None, SQUARE, times=np.array([0.0, 1.0]), truth=FLOW._replace(F=np.eye(3))
+        ),
+        "truth.F: expected shape (2, 2), got shape (3, 3)",
+    ),
+    "times that do not increase, continuous": (
+        lambda: ej.error_bounds_continuous(FLOW, None, SQUARE, times=np.array([1.0, 1.0])),
+        "times: expected at least two increasing times, got [1. 1.]",
+    ),
+    # delays
+    "a sensor beyond the table": (
+        lambda: by_sensor(np.array([1.0, 2.0]), np.array([0, 5])),
+        "sensor: expected an index below 2, got 5",
+    ),
+    "a negative sensor, for a table": (
+        lambda: by_sensor(np.array([1.0, 2.0]), -1),
+        "sensor: expected an index >= 0, got -1",
+    ),
+    "losing more than everything": (
+        lambda: losses(jax.random.key(0), 3, 5),
+        "probability: expected a number between 0 and 1, got 3",
+    ),
 }
+
+
+def weighted(**fields):
+    return ej.weighted_covariances(SYSTEM._replace(**fields), SQUARE, fading=1.1, steps=3)
+
+
+def bucy(signal=None, fading_rate=0.0, rtol=None, **fields):
+    signal = Signal(np.array([0.0, 1.0]), np.zeros((2, 1))) if signal is None else signal
+    return ej.kalman_bucy(
+        FLOW._replace(**fields), None, signal, prior=PRIOR, times=np.array([0.0, 1.0]),
+        fading_rate=fading_rate, rtol=rtol,
+    )  # fmt: skip
 
 
 def scalar():

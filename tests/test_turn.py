@@ -78,7 +78,7 @@ def test_in_order_it_is_the_same_measurements_sorted(batch):
     rows = np.arange(500)[:, None]
     for a, b in zip(sorted_in.measurements, batch.measurements, strict=True):
         full = np.broadcast_to(b, (500, *np.shape(b)[-(a.ndim - 1) :]))
-        np.testing.assert_array_equal(a, full[rows, order])
+        np.testing.assert_allclose(a, full[rows, order], rtol=1e-12, atol=1e-12)
     here = turn_state(sorted_in.measurements.time)[..., :2]
     np.testing.assert_allclose(sorted_in.truth, here, rtol=1e-14)
     at = np.repeat(np.arange(31.0), 2)

@@ -1,7 +1,7 @@
 """What exponential data weighting does to a discrete filter: Anderson (1973), section 5."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.riccati import gain
 from ewif_jax.analysis.stabilising import discrete_lyapunov, stabilising_dare
 from ewif_jax.analysis.stability import require_steady_state
+from ewif_jax.estimator import float_dtype
 
 
 class System(NamedTuple):
@@ -69,10 +70,19 @@ def weighted_covariances(system: System, cov0: Array, *, fading: Array, steps: i
         fading: alpha >= 1, () or (T,).
         steps: T.
 
+    Raises:
+        ValueError: wrong shapes; cov0, Q or R not PSD; fading < 1; steps < 1.
+
     Reduces to: the Kalman filter for alpha = 1.
     """
     checks.at_least("fading", fading, 1.0)
-    return _weighted_covariances(system, jnp.asarray(cov0), fading, steps)
+    steps = checks.whole("steps", steps, 1)
+    if np.ndim(fading):
+        checks.shape("fading", fading, (steps,))
+    checks.shape("cov0", cov0, ("n", "n"))
+    checks.psd("cov0", cov0)
+    check_system("system", system, np.shape(cov0)[:1], steps)
+    return _weighted_covariances(system, _floats(cov0), fading, steps)
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -107,13 +117,27 @@ def actual_error(
         system: the true system.
         cov0: covariance (n, n) of the true initial state around the filter's.
         design: the system whose F and H the filter uses, if not the true ones. The error then
-            depends on the state itself, so the second moments of state and estimate are carried.
+            depends on the state itself, so the second moments of state and error are carried.
         mean0: true mean of the initial state (n,), default 0; it matters with a `design` only, the
             estimate being assumed to start there.
 
+    Raises:
+        ValueError: wrong shapes; cov0, Q or R not PSD.
+
+    Reduces to: (5-19), (5-20) for a design with the true F and H.
+
     Deviations: the second bracket of (5-20) is printed without its transpose.
     """
-    return _actual_error(jnp.asarray(gain), system, jnp.asarray(cov0), design, mean0)
+    checks.shape("gain", gain, ("T", "n", "m"))
+    steps, n, m = np.shape(gain)
+    checks.shape("cov0", cov0, (n, n))
+    checks.psd("cov0", cov0)
+    check_system("system", system, (n,), steps, m)
+    if design is not None:
+        check_system("design", design, (n,), steps, m)
+    if mean0 is not None:
+        checks.shape("mean0", mean0, (n,))
+    return _actual_error(_floats(gain), system, _floats(cov0), design, mean0)
 
 
 @jax.jit
@@ -131,17 +155,16 @@ def _actual_error(
 
         return lax.scan(body, cov0, (truth, gain))[1]
     mean = jnp.zeros(n, cov0.dtype) if mean0 is None else jnp.asarray(mean0)
-    away = jnp.outer(mean, mean)
-    moments = jnp.block([[cov0 + away, away], [away, away]])
+    moments = jnp.block([[cov0 + jnp.outer(mean, mean), cov0], [cov0, cov0]])
+    eye = jnp.eye(n, dtype=cov0.dtype)
 
     def both(S: Array, step: tuple[System, System, Array]) -> tuple[Array, Array]:
         (F, H, Q, R), (F_used, H_used, _, _), K = step
-        seen = K @ H
-        kept = F_used - K @ H_used @ F_used
-        move = jnp.block([[F, jnp.zeros_like(F)], [seen @ F, kept]])
-        noise = jnp.block([[Q, Q @ seen.T], [seen @ Q, seen @ Q @ seen.T + K @ R @ K.T]])
+        left, kept = eye - K @ H, (eye - K @ H_used) @ F_used
+        move = jnp.block([[F, jnp.zeros_like(F)], [left @ F - kept, kept]])
+        noise = jnp.block([[Q, Q @ left.T], [left @ Q, left @ Q @ left.T + K @ R @ K.T]])
         S = _symmetric(move @ S @ move.T + noise)
-        return S, S[:n, :n] - S[:n, n:] - S[n:, :n] + S[n:, n:]
+        return S, S[n:, n:]
 
     return lax.scan(both, moments, (truth, _stacked(design, steps), gain))[1]
 
@@ -149,7 +172,9 @@ def _actual_error(
 def error_bounds(system: System, cov0: Array, *, fading: Array, steps: int) -> Bounds:
     r"""The bounds :math:`P(k) \le \mathcal E(k) \le \Pi_\alpha(k)` (5-18), all three.
 
-    Arguments as in `weighted_covariances`. Equal throughout for alpha = 1.
+    Arguments and errors as in `weighted_covariances`.
+
+    Reduces to: three equal covariances for alpha = 1.
     """
     design = weighted_covariances(system, cov0, fading=fading, steps=steps)
     best = weighted_covariances(system, cov0, fading=jnp.ones(()), steps=steps).cov
@@ -166,8 +191,20 @@ def weighting_as_process_noise(F: Array, Q: Array, cov: Array, fading: Array) ->
         cov: Pi(k-1), (n, n): known only once the weighted filter has been designed.
         fading: alpha, ().
 
+    Raises:
+        ValueError: wrong shapes; Q or cov not PSD; fading < 1.
+
     Deviations: (5-16) prints Pi(k) for Pi(k-1).
+
+    See also: `weighting_as_input_noise`, the same in continuous time. `equivalent_process_noise` is
+    another question: the noise with which a Kalman filter behaves like an EWIF.
     """
+    checks.at_least("fading", fading, 1.0)
+    checks.shape("F", F, ("n", "n"))
+    for name, x in (("Q", Q), ("cov", cov)):
+        checks.shape(name, x, np.shape(F))
+        checks.psd(name, x)
+    F, Q = jnp.asarray(F), jnp.asarray(Q)
     return Q + (jnp.square(fading) - 1) * (F @ jnp.asarray(cov) @ F.T)
 
 
@@ -181,10 +218,14 @@ def steady_state(system: System, *, fading: Array = 1.0) -> SteadyState:  # type
 
     Raises:
         ValueError: fading < 1; there is no such state: a mode that does not decay is not seen, or
-            a mode that neither grows nor decays is not driven.
+            a mode that neither grows nor decays is not driven; wrong shapes, Q not PSD, R not
+            positive definite.
     """
     checks.at_least("fading", fading, 1.0)
-    F, H, Q, R = (jnp.asarray(x) for x in system)
+    checks.shape("fading", fading, ())
+    check_system("system", system, np.shape(system[0])[:1])
+    checks.psd("system.R", system[3], definite=True)
+    F, H, Q, R = (_floats(x) for x in system)
     weighted = jnp.asarray(fading, F.dtype) * F
     require_steady_state(weighted, H, Q, on_edge=lambda values: np.abs(values) - 1)
     return _steady_state(System(F, H, Q, R), weighted)
@@ -198,6 +239,33 @@ def _steady_state(system: System, weighted: Array) -> SteadyState:
     left = jnp.eye(F.shape[0], dtype=F.dtype) - K @ H
     error = discrete_lyapunov(left @ F, left @ Q @ left.T + K @ R @ K.T)
     return SteadyState(predicted, _updated(predicted, K, H, R), error, K, F @ left)
+
+
+def check_system(
+    name: str, system: System, n: tuple[int, ...], steps: int | None = None, m: Any = "m"
+) -> None:
+    """Refuses matrices of a system of n states that do not fit each other, are not finite, or are
+    no covariances; `steps` is the length of those that are stacked (None: none may be)."""
+    ok = isinstance(system, tuple) and len(system) == 4
+    checks.require(ok, name, "a System(F, H, Q, R)", type(system).__name__)
+    system = System(*system)
+    if m == "m":
+        m = np.shape(system.H)[-2] if np.ndim(system.H) > 1 else m
+    shapes = {"F": (*n, *n), "H": (m, *n), "Q": (*n, *n), "R": (m, m)}
+    for (field, x), shape in zip(system._asdict().items(), shapes.values(), strict=True):
+        label = f"{name}.{field}"
+        stacked = steps is not None and np.ndim(x) == 3
+        checks.shape(label, x, (steps, *shape) if stacked else shape)  # type: ignore[arg-type]
+        checks.finite(label, x)
+        value = checks.known(x)
+        if field in "QR" and value is not None:
+            for k, one in enumerate(value if stacked else [value]):
+                checks.psd(f"{label}[{k}]" if stacked else label, one)
+
+
+def _floats(x: Any) -> Array:
+    x = jnp.asarray(x)
+    return x.astype(float_dtype(x))
 
 
 def _updated(predicted: Array, K: Array, H: Array, R: Array) -> Array:

@@ -109,6 +109,9 @@ def equivalent_process_noise(
             ``lambda q: {"q": q}``.
         case, m, steps: as in `equivalent_tau`.
         bounds: search interval for q.
+
+    See also: `weighting_as_process_noise` and `weighting_as_input_noise`, Anderson's (5-16) and
+    (4-7): the noise, another one at every step, that has exactly the gains of a weighted filter.
     """
     checks.positive("dt", dt)
     checks.positive("tau", tau)

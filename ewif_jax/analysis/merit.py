@@ -3,12 +3,15 @@
 import operator
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.analysis.riccati import dare, gain
+from ewif_jax.analysis.powers import last_time_above, real_power
+from ewif_jax.analysis.riccati import gain
+from ewif_jax.analysis.stabilising import strong_dare
 
 
 def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
@@ -18,22 +21,24 @@ def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
         K = C^p H' (H C^p H' + R)^{-1}, \quad
         C^p = F (C^p - C^p H' (H C^p H' + R)^{-1} H C^p) F' + Q \quad (3)
 
-    Yoder et al., section 2.3. Differentiable in every argument, forward and reverse.
+    Yoder et al., section 2.3. Of several solutions it is the one that the filter reaches from any
+    positive definite covariance: a growing mode is followed, whether noise drives it or not.
+    Differentiable in every argument, forward and reverse.
 
     Args:
         F, H, Q, R: (n, n), (m, n), (n, n), (m, m); plain numbers for a scalar system. Q may be
             singular.
 
     Returns:
-        K, or NaN where the filter has no steady state (an undetectable growing mode).
+        K, or NaN where the filter has no steady state (a mode that does not decay and is not seen).
+        K has no derivative where a mode neither grows nor decays and no noise drives it.
 
     Raises:
         ValueError: wrong shapes; Q not PSD; R not positive definite.
 
     Reduces to: `random_walk_gain`, `alpha_beta_gains`.
     """
-    F, H, Q, R = _system(F, H, Q, R)
-    return gain(dare(F, H, Q, R), H, R)
+    return _steady_gain(*_system(F, H, Q, R))
 
 
 def delayed_gain(F: Any, H: Any, Q: Any, R: Any, steps: Any) -> Array:
@@ -45,45 +50,59 @@ def delayed_gain(F: Any, H: Any, Q: Any, R: Any, steps: Any) -> Array:
     Args:
         F, H, Q, R: as in `steady_state_gain`.
         steps: T_d / dT >= 0. A Python integer is a product of matrices; any other number goes
-            through the eigenvalues (principal branch, real part), which needs distinct ones.
+            through the eigenvectors (principal branch, real part).
+
+    Raises:
+        ValueError: as `steady_state_gain`; steps < 0 or not a single number.
+
+    Reduces to: `steady_state_gain` at 0; eq. (7) for a random walk.
     """
-    F, H, Q, R = _system(F, H, Q, R)
-    K = gain(dare(F, H, Q, R), H, R)
+    system = _system(F, H, Q, R)
     checks.at_least("steps", steps, 0)
-    loop = (jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F
+    checks.shape("steps", steps, ())
     if isinstance(steps, int | np.integer):
+        K, loop = _settled(*system)
         return jnp.linalg.matrix_power(loop, operator.index(steps)) @ K
-    # the result does not depend on how eigenvectors are scaled, so their derivative is safe here
-    values, vectors = lax.linalg.eig(
-        loop, compute_left_eigenvectors=False, enable_eigvec_derivs=True
-    )
-    modes = jnp.linalg.solve(vectors, K.astype(vectors.dtype))
-    return jnp.real(vectors @ (_power(values, steps)[:, None] * modes))
+    return _delayed(*system, jnp.asarray(steps, system[0].dtype))
 
 
 def cutoff_delay(F: Any, H: Any, Q: Any, R: Any, *, ratio: Any = 0.6, interval: Any = 1.0) -> Array:
-    r"""The delay T_d () in seconds at which the gain has decayed to `ratio` of a fresh one's.
+    r"""The delay T_d () in seconds from which on the gain stays below `ratio` of a fresh one's.
 
     .. math::
-        T_d = \Delta T \frac{\log(k_{min} / k)}{\log \rho((I - K H) F)} \quad (8)
+        T_d = \max \{ T : \| K_n(T) \| \ge \mathrm{ratio} \, \| K_n(0) \| \}, \quad
+        K_n(T) = ((I - K H) F)^{T / \Delta T} K
 
-    The gain of more than one state may oscillate, so what is followed to `ratio` is its
-    exponential envelope, whose rate is the spectral radius.
+    The gain of more than one state may oscillate and swell before it fades, so the last crossing
+    counts. The norm is Frobenius', in the units of the state: scale the state to weigh its
+    components. For a scalar system this is
+
+    .. math::
+        T_d = \Delta T \, \frac{\log(k_{min} / k)}{\log((1 - k h) f)} \quad (8)
+
+    Differentiable, where the crossing is not a touch.
 
     Args:
         F, H, Q, R: as in `steady_state_gain`, over one interval between measurements.
         ratio: k_min / k in (0, 1).
         interval: mean time between measurements in seconds.
 
+    Returns:
+        T_d >= 0; inf where the gain does not decay (a mode that neither grows nor decays and is
+        not driven); NaN where there is no gain to compare with: no steady state, or K = 0.
+
+    Raises:
+        ValueError: as `steady_state_gain`; ratio outside (0, 1); interval <= 0.
+
     Reduces to: eq. (8), `random_walk_cutoff`, for a scalar system.
 
-    Deviations: the text after (8) keeps "T >= T_d"; T <= T_d is meant.
+    Deviations: (8) is for one state; here any number, by the norm. The text after (8) keeps
+        "T >= T_d"; T <= T_d is meant.
     """
     _fraction(ratio)
-    F, H, Q, R = _system(F, H, Q, R)
-    K = gain(dare(F, H, Q, R), H, R)
-    values = jnp.linalg.eigvals((jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F)
-    return interval * jnp.log(ratio) / jnp.log(jnp.max(jnp.abs(values)))
+    checks.positive("interval", interval)
+    system = _system(F, H, Q, R)
+    return interval * _cutoff(*system, jnp.asarray(ratio, system[0].dtype))
 
 
 def maneuvering_index(
@@ -99,6 +118,9 @@ def maneuvering_index(
         r: measurement variance :math:`\sigma_R^2` in m^2.
         interval: time between measurements in seconds.
         motion: which of the two.
+
+    Raises:
+        ValueError: q < 0; r <= 0; interval < 0; an unknown motion.
     """
     expected = "'random_walk' or 'acceleration'"
     checks.require(motion in ("random_walk", "acceleration"), "motion", expected, repr(motion))
@@ -120,6 +142,9 @@ def random_walk_gain(index: Any) -> Array:
 
     Args:
         index: lambda >= 0 of `maneuvering_index`.
+
+    Raises:
+        ValueError: index < 0.
     """
     index = jnp.asarray(checks.at_least("index", index, 0.0))
     return 2 * index / (index + jnp.hypot(index, 2))
@@ -133,8 +158,12 @@ def random_walk_cutoff(index: Any, *, ratio: Any = 0.6, interval: Any = 1.0) -> 
         index: lambda > 0 of `maneuvering_index`.
         ratio: k_min / k in (0, 1).
         interval: mean time between measurements in seconds.
+
+    Raises:
+        ValueError: index <= 0; ratio outside (0, 1); interval <= 0.
     """
     _fraction(ratio)
+    checks.positive("interval", interval)
     index = jnp.asarray(checks.positive("index", index))
     return -interval * jnp.log(ratio) / (2 * jnp.arcsinh(index / 2))
 
@@ -153,6 +182,9 @@ def alpha_beta_gains(index: Any) -> tuple[Array, Array]:
 
     Args:
         index: lambda >= 0 of `maneuvering_index(..., "acceleration")`.
+
+    Raises:
+        ValueError: index < 0.
     """
     index = jnp.asarray(checks.at_least("index", index, 0.0))
     travel = index + jnp.sqrt(index) * jnp.sqrt(index + 8)
@@ -167,6 +199,9 @@ def alpha_beta_eigenvalues(index: Any) -> Array:
         1 - \frac{\alpha + \beta}{2} \pm \frac12 \sqrt{(\alpha + \beta)^2 - 4 \beta} \quad (13)
 
     They are a complex pair for every lambda < 8: the delayed gain then changes sign.
+
+    Raises:
+        ValueError: index < 0.
     """
     alpha, beta = alpha_beta_gains(index)
     half = (alpha + beta) / 2
@@ -196,6 +231,10 @@ def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> Ga
         first_cov: (n, n) predicted covariance at the first measurement.
         lag: how many earlier measurements to follow, >= 0.
 
+    Raises:
+        ValueError: wrong shapes; numbers that are not finite; first_cov or a Q not PSD; R not
+            positive definite; lag < 0.
+
     Reduces to: `delayed_gain` for equal intervals after many steps.
 
     Deviations: as printed k(j,0) lacks h, the gains are shifted by the wrong index, and c^p(1) is
@@ -209,6 +248,12 @@ def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> Ga
     checks.shape("H", H, ("m", n))
     checks.shape("R", R, (m, m))
     checks.shape("first_cov", cov, (n, n))
+    checks.finite("F", F)
+    checks.finite("H", H)
+    for k, one in enumerate(() if checks.known(Q) is None else np.asarray(Q)):
+        checks.psd(f"Q[{k}]", one)
+    checks.psd("R", R, definite=True)
+    checks.psd("first_cov", cov)
     eye = jnp.eye(n, dtype=F.dtype)
 
     def body(carry: tuple, motion: tuple[Array, Array]) -> tuple[tuple, GainHistory]:
@@ -226,11 +271,28 @@ def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> Ga
     return lax.scan(body, start, still)[1]
 
 
-def _power(values: Array, steps: Any) -> Array:
-    """values^steps with 0^0 = 1 and 0^s = 0, finite gradients included."""
-    zero = values == 0
-    raised = jnp.exp(steps * jnp.log(jnp.where(zero, 1, values)))
-    return jnp.where(zero, jnp.where(steps == 0, 1, 0), raised)
+@jax.jit
+def _steady_gain(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    return gain(strong_dare(F, H, Q, R), H, R)
+
+
+@jax.jit
+def _settled(F: Array, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
+    """K, and (I - K H) F."""
+    K = gain(strong_dare(F, H, Q, R), H, R)
+    return K, (jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F
+
+
+@jax.jit
+def _delayed(F: Array, H: Array, Q: Array, R: Array, steps: Array) -> Array:
+    K, loop = _settled(F, H, Q, R)
+    return real_power(loop, steps) @ K
+
+
+@jax.jit
+def _cutoff(F: Array, H: Array, Q: Array, R: Array, ratio: Array) -> Array:
+    K, loop = _settled(F, H, Q, R)
+    return last_time_above(loop, K, ratio)
 
 
 def _fraction(ratio: Any) -> None:
@@ -251,6 +313,8 @@ def _system(F: Any, H: Any, Q: Any, R: Any) -> tuple[Array, Array, Array, Array]
     checks.shape("H", H, (m, n))
     checks.shape("Q", Q, (n, n))
     checks.shape("R", R, (m, m))
+    checks.finite("F", F)
+    checks.finite("H", H)
     checks.psd("Q", Q)
     checks.psd("R", R, definite=True)
     return F, H, Q, R

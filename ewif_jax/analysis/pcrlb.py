@@ -40,10 +40,15 @@ def pcrlb(
     Args:
         model, params: the world.
         measurements: T of them, none earlier than the one before; their values are not used.
-        truth: (T, n) or (R, T, n) true states at the measurements.
+        truth: (T, n) or (R, T, n) true states at the measurements, in the units of the model's
+            state.
         start: (n,) or (R, n) true states at t0.
-        prior_cov: (n, n) covariance of what is known at t0.
+        prior_cov: (n, n) covariance of what is known at t0, in products of those units.
         t0: seconds.
+
+    Returns:
+        (T, n, n) in products of the units of the state (m^2, m^2/s, ... for kinematic models); the
+        square root of a diagonal element bounds an RMSE.
 
     Reduces to: the covariance of `kalman` for a linear model; that of `extended` linearised at the
         truth for one trajectory.
@@ -98,8 +103,11 @@ def pcrlb_late(
         model, params, start (n,), prior_cov, t0: as in `pcrlb`.
         measurements: T in their order of arrival.
         truth: (T, n) true states at the times of the measurements.
-        times: (T,) when to report after arrival k; NaN where a measurement that has arrived is
-            newer than the report.
+        times: (T,) seconds, when to report after arrival k.
+
+    Returns:
+        (T, n, n) in the units of `pcrlb`; NaN where a measurement that has arrived is newer than
+        the report.
 
     Reduces to: `pcrlb` where nothing is late and the reports are at the measurements.
 
@@ -157,7 +165,10 @@ def pcrlb_equivalent(
         model, params, start (n,), prior_cov, t0: as in `pcrlb`; motion must run backwards.
         measurements: T in their order of arrival.
         truth: (T, n) true states at `times`.
-        times: (T,) report times, not decreasing, none earlier than its measurement.
+        times: (T,) report times in seconds, not decreasing, none earlier than its measurement.
+
+    Returns:
+        (T, n, n) in the units of `pcrlb`.
 
     Reduces to: `pcrlb` where nothing is late and the reports are at the measurements.
 

@@ -39,6 +39,23 @@ def stabilising_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
     return _root(defect, guess, refined, Q)
 
 
+def strong_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    r"""The solution P (n, n) that the filter reaches from any positive definite covariance.
+
+    It is the stabilising one, or where a mode on the unit circle is not driven (and none that grows
+    is) the limit, whose filter keeps that mode as it is. NaN where there is none.
+    """
+    least = dare(F, H, Q, R)
+    left = F - F @ gain(least, H, R) @ H
+    radius = jnp.max(jnp.abs(jnp.linalg.eigvals(lax.stop_gradient(left))))
+    settled = radius <= 1 + jnp.sqrt(jnp.finfo(F.dtype).eps)
+
+    def follow(_: Array) -> Array:
+        return stabilising_dare(F, H, Q, R)
+
+    return lax.cond(settled, lambda P: P, follow, least)
+
+
 def stabilising_care(F: Array, H: Array, Q: Array, R: Array) -> Array:
     r"""The solution P (n, n) whose filter is stable; NaN where there is none.
 

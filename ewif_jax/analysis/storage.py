@@ -31,6 +31,9 @@ def storage(estimator: Estimator, n: int, *, params: Any = None, key: Any = None
         params: its parameters, where `init` needs them.
         key: PRNG key (default `jax.random.key(0)`).
 
+    Returns:
+        A `Storage`: numbers, bytes in the default float dtype, and numbers by field.
+
     Orguner & Gustafsson (32) and Pornsarayouth & Yamakita count in words what this counts in
     numbers.
 

@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.analysis.anderson_continuous import ContinuousSystem
+from ewif_jax.analysis.anderson_continuous import ContinuousSystem, check_continuous
+from ewif_jax.estimator import float_dtype
 from ewif_jax.kernels import symmetric
 from ewif_jax.types import Gaussian
 
@@ -66,7 +68,8 @@ def kalman_bucy(
         max_steps: of the solver, which steps to every sample; exceeding it is an error.
 
     Raises:
-        ValueError: shapes, times that do not increase or leave the signal, fading_rate < 0.
+        ValueError: shapes; times that do not increase or leave the signal; Q (at the start) not
+            PSD, R not positive definite; fading_rate < 0; tolerances that are not positive.
         ImportError: diffrax is not installed.
 
     Reduces to: the filter without weighting for alpha = 0; `steady_state_continuous` as time grows.
@@ -76,10 +79,13 @@ def kalman_bucy(
     need_diffrax()
     checks.prior(checks.needs_prior(prior, "kalman_bucy"))
     _check_times(signal, times)
-    if not callable(fading_rate):
-        checks.at_least("fading_rate", fading_rate, 0.0)
-    dtype = jnp.asarray(signal.value).dtype
-    samples = Signal(jnp.asarray(signal.time, dtype), jnp.asarray(signal.value))
+    dtype = float_dtype(signal.value)
+    check_design(
+        system, fading_rate, params, jnp.asarray(times, dtype)[0],
+        np.shape(prior.mean)[0], np.shape(signal.value)[1],
+    )  # fmt: skip
+    check_solver(rtol, atol, max_steps)
+    samples = Signal(jnp.asarray(signal.time, dtype), jnp.asarray(signal.value, dtype))
     functions, constants = split((*system, fading_rate), dtype)
     tolerances = (rtol, atol, max_steps)
     prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
@@ -192,16 +198,41 @@ def solve(
     ).ys
 
 
+def check_design(
+    system: ContinuousSystem, fading_rate: Any, params: Any, start: Array, n: int, m: Any = "m"
+) -> None:
+    """Refuses a filter's system and fading rate as they are at the `start`."""
+    check_continuous("system", system, n, m, params=params, start=start)
+    rate = fading_rate(params, start) if callable(fading_rate) else fading_rate
+    checks.shape("fading_rate", rate, ())
+    checks.at_least("fading_rate", rate, 0.0)
+
+
+def check_solver(rtol: float | None, atol: float | None, max_steps: int) -> None:
+    """Refuses settings that no solver can use."""
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            checks.positive(name, value)
+    checks.whole("max_steps", max_steps, 1)
+
+
+def check_increasing(name: str, times: Any) -> None:
+    """Refuses known times that are not finite, fewer than two, or do not increase."""
+    value = checks.known(times)
+    if value is not None:
+        checks.finite(name, value)
+        increasing = value.size > 1 and bool((value[1:] > value[:-1]).all())
+        checks.require(increasing, name, "at least two increasing times", value)
+
+
 def _check_times(signal: Signal, times: Any) -> None:
     checks.shape("signal.time", signal.time, ("S",))
-    checks.shape("signal.value", signal.value, (jnp.shape(signal.time)[0], "m"))
+    checks.shape("signal.value", signal.value, (np.shape(signal.time)[0], "m"))
+    checks.finite("signal.value", signal.value)
     checks.shape("times", times, ("K",))
+    check_increasing("times", times)
+    check_increasing("signal.time", signal.time)
     known, samples = checks.known(times), checks.known(signal.time)
-    for name, value in (("times", known), ("signal.time", samples)):
-        if value is not None:
-            checks.finite(name, value)
-            increasing = value.size > 1 and bool((value[1:] > value[:-1]).all())
-            checks.require(increasing, name, "at least two increasing times", value)
     if known is not None and samples is not None:
         inside = samples[0] <= known[0] and known[-1] <= samples[-1]
         checks.require(

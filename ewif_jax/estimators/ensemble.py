@@ -75,15 +75,16 @@ def ensemble(
         params: Any, state: EnsembleState, measurement: Measurement
     ) -> tuple[EnsembleState, Info]:
         late, present = measurement.time < state.time, jnp.any(measurement.mask)
-        used = present & ~late
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
         looked = ensembles.look(model, params, state.members, state.members, measurement)
+        used = present & ~late & looked.good
         if form == "stochastic":
             updated = ensembles.perturbed(model, state.members, looked, measurement, own)
         else:
             updated = ensembles.transformed(state.members, looked)
         delay = state.time - measurement.time
-        info = ensembles.info_of(looked, measurement.mask, delay, used, verdict(late, present))
+        status = verdict(late, present, good=looked.good)
+        info = ensembles.info_of(looked, delay, used, status)
         return choose(used, state._replace(members=updated, sight=sight), state), info
 
     def estimate(params: Any, state: EnsembleState) -> Gaussian:

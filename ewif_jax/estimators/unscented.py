@@ -11,7 +11,7 @@ from ewif_jax.forms.covariance import CovarianceState, covariance_form
 from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.kernels import symmetric
 from ewif_jax.models import Model
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
 def unscented(
@@ -73,12 +73,13 @@ def unscented(
         params: Any, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
         late, present = measurement.time < state.time, jnp.any(measurement.mask)
-        used = present & ~late
         mean, cov, info = measure_around(model, points, params, state.mean, state.cov, measurement)
+        good = info.status == Status.USED
+        used = present & ~late & good
         info = info._replace(
             log_likelihood=jnp.where(used, info.log_likelihood, 0),
             delay=state.time - measurement.time,
-            status=verdict(late, present),
+            status=verdict(late, present, good=good),
         )
         return choose(used, CovarianceState(state.time, mean, cov), state), info
 

@@ -8,9 +8,10 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import verdict
-from ewif_jax.kernels import gaussian, symmetric
+from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.kernels import symmetric
 from ewif_jax.models import Model, flow, sight
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
 class CovarianceState(NamedTuple):
@@ -64,7 +65,7 @@ def covariance_form(
         mean, cov, info = measure(model, params, state.mean, state.cov, used)
         info = info._replace(
             delay=state.time - measurement.time,
-            status=verdict(late, present),
+            status=verdict(late, present, good=info.status == Status.USED),
         )
         return CovarianceState(state.time, mean, cov), info
 
@@ -79,21 +80,13 @@ def measure(
     model: Model, params: Any, mean: Array, cov: Array, measurement: Measurement
 ) -> tuple[Array, Array, Info]:
     """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
-    (delay 0, status USED)."""
+    (delay 0, status USED or REJECTED)."""
     predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     checks.shape("H", H, ("m", mean.shape[0]))
     checks.shape("R", R, (H.shape[0],) * 2)
     difference = model.residual(measurement.value, predicted, measurement.sensor)
-    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, measurement.mask)
-    info = Info(
-        innovation.value,
-        innovation.cov,
-        gaussian.log_density(innovation, measurement.mask),
-        jnp.zeros((), mean.dtype),
-        jnp.zeros((), jnp.int32),
-    )
-    return mean, cov, info
+    return updated(model, mean, cov, Compared(difference, H, R, measurement.mask))
 
 
 def _saturated(factor: Array, cov: Array) -> Array:

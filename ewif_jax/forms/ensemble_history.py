@@ -95,9 +95,10 @@ def delayed(
         there = jnp.where(late, there, now.members)
         looked = ensembles.look(model, params, now.members, there, measurement)
         updated = ensembles.perturbed(model, now.members, looked, measurement, own)
-        used = known & present
-        status = verdict(late, present, jnp.where(known, Status.LATE_USED, Status.TOO_LATE))
-        info = ensembles.info_of(looked, measurement.mask, state.time - time, used, status)
+        used = known & present & looked.good
+        late_status = jnp.where(known, Status.LATE_USED, Status.TOO_LATE)
+        status = verdict(late, present, late_status, looked.good)
+        info = ensembles.info_of(looked, state.time - time, used, status)
         taken = state._replace(
             now=now._replace(members=updated, sight=sight), used=jnp.asarray(True)
         )

@@ -8,6 +8,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose
+from ewif_jax.forms.innovations import numbers
 from ewif_jax.forms.sigma_points import view
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.small import matmul, matvec
@@ -27,12 +28,15 @@ class EnsembleState(NamedTuple):
 
 class Look(NamedTuple):
     """What an ensemble makes of a measurement: seen (m, N), what its members predict, deviations
-    (m, N) from their mean, the noise root G (m, m) with R = G G', and the innovation."""
+    (m, N) from their mean, the noise root G (m, m) with R = G G', the innovation, and mask (m,) of
+    what is used: nothing if innovation or log density are not finite (good () is False then)."""
 
     seen: Array
     deviations: Array
     noise: Array
     innovation: gaussian.Innovation
+    mask: Array
+    good: Array
 
 
 def start(prior: Gaussian | None, t0: Any, key: Any, count: int, method: str) -> EnsembleState:
@@ -114,12 +118,15 @@ def look(model: Model, params: Any, members: Array, there: Array, measurement: M
 
     offsets = jax.vmap(offset, in_axes=1, out_axes=1)(seen)
     shift = jnp.mean(offsets, 1)
-    deviations = jnp.where(mask[:, None], offsets - shift[:, None], 0)
+    known = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
+    deviations = jnp.where(mask[:, None] & known, offsets - shift[:, None], 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
-    cross = covariance(deviations, members)
-    innovation = gaussian.innovate(difference, cross, spread(deviations) + R, mask)
+    cov = spread(deviations) + R
+    good = known & numbers(difference, cov, mask)
+    mask = mask & good
+    innovation = gaussian.innovate(difference, covariance(deviations, members), cov, mask)
     root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
-    return Look(seen, deviations, root, innovation)
+    return Look(seen, jnp.where(good, deviations, 0), root, innovation, mask, good)
 
 
 def perturbed(
@@ -132,7 +139,7 @@ def perturbed(
 
     drawn = noise(key, looked.noise, members.shape[1])
     own = jax.vmap(innovation, in_axes=1, out_axes=1)(looked.seen + drawn)
-    own = jnp.where(measurement.mask[:, None], own, 0)
+    own = jnp.where(looked.mask[:, None], own, 0)
     return members + matmul(gaussian.gain(looked.innovation), own)
 
 
@@ -151,9 +158,9 @@ def transformed(members: Array, looked: Look) -> Array:
     return members + step[:, None] - matmul(gain, looked.deviations)
 
 
-def info_of(looked: Look, mask: Array, delay: Array, used: Array, status: Array) -> Info:
+def info_of(looked: Look, delay: Array, used: Array, status: Array) -> Info:
     """Diagnostics of an update with this look."""
-    density = gaussian.log_density(looked.innovation, mask)
+    density = gaussian.log_density(looked.innovation, looked.mask)
     value, cov = looked.innovation.value, looked.innovation.cov
     return Info(value, cov, jnp.where(used, density, 0), delay, status)
 

@@ -42,7 +42,8 @@ def lines(
     """Algorithm 1 of Orguner & Gustafsson up to the last measurement inside (tau, now).
 
     `count` particles are drawn from `start`, moved to tau and kept there, moved on through the
-    measurements ((L,) in order of time), weighed by each and resampled with what they keep.
+    measurements ((L,) in order of time), weighed by each and resampled (systematic) with what they
+    keep where fewer than half of them count.
 
     Deviations: the printed recursion does not say that particles are weighed by y(m).
     """
@@ -83,8 +84,8 @@ def look_back(
 
     with r the last time before k of the lines: N M densities, in blocks of `BLOCK` rows that are
     normalised by their largest term (most underflow otherwise). Where the best lines of a particle
-    leave nothing of p(y | xi), the particle gets weight zero. A singular Q has no density: then
-    nothing is a number.
+    leave nothing of p(y | xi), the particle gets weight zero. A singular Q has no density: no
+    particle then has a weight, and the measurement is `REJECTED`.
     """
     ahead = form.transported(model, params, last.particles, last.time, now)
     f = cholesky.factor(jnp.asarray(model.process_cov(params, last.time, now), ahead.dtype))
@@ -94,7 +95,7 @@ def look_back(
     best = jnp.max(seen.log_density)
     best = jnp.where(best > -jnp.inf, best, 0)
     density = jnp.exp(seen.log_density - best)
-    difference, R, _ = form.compared(model, params, last.fixed, measurement)
+    difference, _, R, _ = form.compared(model, params, last.fixed, measurement)
     m = difference.shape[0]
     squares = (difference[:, None] * difference[None]).reshape(m * m, -1)
     columns = jnp.stack([jnp.ones_like(density), density, *difference, *squares], 1)

@@ -116,6 +116,16 @@ def leave(state: State, time: Array, go: Callable[[State], State]) -> State:
     return lax.cond(time > state.time, go, stay, state)
 
 
+def predictor(kind: Cloud) -> Callable[[Any, State, Array], State]:
+    """The `predict` of an estimator whose particles keep nothing of their past."""
+
+    def predict(params: Any, state: State, time: Array) -> State:
+        time = jnp.asarray(time, state.time.dtype)
+        return leave(state, time, lambda s: step_ahead(kind, params, s, time)[0])
+
+    return predict
+
+
 def step_ahead(
     kind: Cloud, params: Any, state: Any, time: Array, along: Any = ()
 ) -> tuple[Any, Any]:
@@ -168,9 +178,7 @@ def look(
 
     A component without noise (singular R) cannot weigh particles: no density is a number then.
     """
-    difference, R, f = compared(model, params, particles, measurement)
-    numbers = jnp.all(jnp.isfinite(difference), 0)
-    difference = jnp.where(numbers, difference, 0)
+    difference, numbers, R, f = compared(model, params, particles, measurement)
     white = cholesky.forward(f, difference)
     size = jnp.sum(measurement.mask).astype(white.dtype) * jnp.log(2 * jnp.pi)
     log_density = -0.5 * (jnp.sum(jnp.square(white), 0) + size) - cholesky.half_log_det(f)
@@ -182,9 +190,9 @@ def look(
 
 def compared(
     model: Model, params: Any, particles: Array, measurement: Measurement
-) -> tuple[Array, Array, cholesky.Factor]:
-    """Measured minus predicted (m, N), R and its factor; absent components have difference 0 and
-    unit variance."""
+) -> tuple[Array, Array, Array, cholesky.Factor]:
+    """Measured minus predicted (m, N), whether it and its square are numbers (N,) (else it is 0), R
+    and its factor; absent components have difference 0 and unit variance."""
     time, value, sensor, mask = measurement
 
     def see(sensor: Any, params: Any, x: Array, time: Array) -> tuple[Array, Array]:
@@ -199,8 +207,9 @@ def compared(
         return model.residual(value, predicted, sensor)
 
     difference = jnp.where(mask[:, None], jax.vmap(compare, -1, -1)(particles), 0)
+    numbers = jnp.all(jnp.isfinite(jnp.square(difference)), 0)
     R = gaussian.mask_cov(R, mask)
-    return difference, R, cholesky.factor(R)
+    return jnp.where(numbers, difference, 0), numbers, R, cholesky.factor(R)
 
 
 def moments(x: Array, weights: Array) -> tuple[Array, Array]:
@@ -208,6 +217,12 @@ def moments(x: Array, weights: Array) -> tuple[Array, Array]:
     mean = matmul(x, weights[:, None])[:, 0]
     spread = x - mean[:, None]
     return mean, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
+
+
+def estimate(params: Any, state: Any) -> Gaussian:
+    """The `estimate` of an estimator whose state begins with the fields of `ParticleState`."""
+    del params
+    return summary(state)
 
 
 def summary(state: Any) -> Gaussian:

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.estimator import choose
 from ewif_jax.forms.covariance import measure
-from ewif_jax.kernels import cholesky, gaussian, sigma_points, symmetric
+from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.kernels import cholesky, sigma_points, symmetric
 from ewif_jax.models.model import Model, flow, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.types import Info, Measurement
@@ -96,10 +98,10 @@ def measure_around(
     measurement: Measurement,
 ) -> tuple[Array, Array, Info]:
     """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
-    (delay 0, status USED)."""
+    (delay 0, status USED or REJECTED)."""
     if points is None:
         return measure(model, params, mean, cov, measurement)
-    sensor, mask = measurement.sensor, measurement.mask
+    sensor = measurement.sensor
     see, R = view(model, params, sensor, measurement.time, mean)
 
     def apart(x: Array, y: Array) -> Array:
@@ -109,15 +111,8 @@ def measure_around(
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
     difference = apart(measurement.value, predicted)
-    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R + left_over, mask)
-    info = Info(
-        innovation.value,
-        innovation.cov,
-        gaussian.log_density(innovation, mask),
-        jnp.zeros((), mean.dtype),
-        jnp.zeros((), jnp.int32),
-    )
-    return mean, cov, info
+    seen = Compared(difference, H, R + left_over, measurement.mask)
+    return updated(model, mean, cov, seen)
 
 
 def _regressed(
@@ -129,7 +124,8 @@ def _regressed(
     cov: Array,
 ) -> tuple[Array, Array, Array]:
     """Mean, slope and left-over covariance of f of a Gaussian. Values are compared through `apart`
-    with the one at the mean, so that angles on both sides of a cut have a mean."""
+    with the one at the mean, so that angles on both sides of a cut have a mean. NaN, without
+    harm to gradients, where a value is not a number."""
     scale, centre = transform(points, params, mean.shape[0], mean.dtype)
     root = cholesky.factor(symmetric.unpack(cov))
     around = mean[:, None] + sigma_points.offsets(root.lower, scale)
@@ -139,5 +135,7 @@ def _regressed(
         return apart(f(x), middle)
 
     differences = jax.vmap(difference, in_axes=1, out_axes=1)(around)
+    good = jnp.all(jnp.isfinite(differences))
+    differences = jnp.where(good, differences, 0)
     shift, slope, left_over = sigma_points.regression(differences, root, scale, centre)
-    return middle + shift, slope, left_over
+    return choose(good, (middle + shift, slope, left_over), (jnp.nan,) * 3)

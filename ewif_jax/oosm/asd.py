@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import verdict
-from ewif_jax.kernels import gaussian, retrodiction, slots
+from ewif_jax.estimator import choose, verdict
+from ewif_jax.forms.innovations import Compared, sound
+from ewif_jax.kernels import gaussian, retrodiction, slots, symmetric
 from ewif_jax.kernels.batched import kernel, total
 from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model, flow, sight
@@ -104,6 +105,9 @@ def asd(model: Model, lag: int) -> Estimator:
         predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
+        by_slot = row.T.reshape(count, -1, row.shape[0])
+        cov = symmetric.pack(slots.picked(by_slot, at))
+        (difference, H, R, mask), good = sound(model, cov, Compared(difference, H, R, mask))
         cross = matmul(H, row)
         own = slots.picked(cross.T.reshape(count, -1, H.shape[0]), at).T
         innovation = gaussian.innovate(difference, cross, matmul(own, H.T) + R, mask)
@@ -122,8 +126,10 @@ def asd(model: Model, lag: int) -> Estimator:
             innovation.cov,
             gaussian.log_density(innovation, mask),
             state.time - measurement.time,
-            verdict(late, present, Status.LATE_USED),
+            verdict(late, present, Status.LATE_USED, good),
         )
+        if model.linear is None:
+            updated = choose(good, updated, state)
         return updated, too_late(info, ~known)
 
     def estimate(params: Any, state: JointState) -> Gaussian:

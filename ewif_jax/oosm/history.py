@@ -9,7 +9,8 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.estimator import choose, verdict
 from ewif_jax.forms.covariance import CovarianceState, covariance_form
-from ewif_jax.kernels import gaussian, retrodiction, slots, symmetric
+from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.kernels import retrodiction, slots, symmetric
 from ewif_jax.kernels.small import fence, matmul, matvec
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -69,17 +70,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
     ) -> tuple[HistoryState, Info]:
         known, start = last_before(state.past, measurement.time)
         mean, cov, info = late_update(model, params, state, start, measurement, noise_estimated)
-        updated = state._replace(mean=mean, cov=cov, used=jnp.asarray(True))
-        late = measurement.time < state.time
-        present = jnp.any(measurement.mask)
-        info = too_late(
-            info._replace(
-                delay=state.time - measurement.time,
-                status=verdict(late, present, Status.LATE_USED),
-            ),
-            ~known,
-        )
-        return choose(known & present, updated, state), info
+        return taken(state, mean, cov, measurement, known, info)
 
     def estimate(params: Any, state: HistoryState) -> Gaussian:
         del params
@@ -125,17 +116,26 @@ def late_update(
     H_now = fence(seen - matmul(seen, gain))
     R_now = fence(R + matmul(matmul(seen, left_over), seen.T))
     difference = model.residual(measurement.value, value, measurement.sensor)
-    mean, cov, innovation = gaussian.update(
-        state.mean, state.cov, difference, H_now, R_now, measurement.mask
-    )
-    info = Info(
-        innovation.value,
-        innovation.cov,
-        gaussian.log_density(innovation, measurement.mask),
-        jnp.zeros((), dtype),
-        jnp.zeros((), jnp.int32),
-    )
-    return mean, cov, info
+    seen = Compared(difference, H_now, R_now, measurement.mask)
+    return updated(model, state.mean, state.cov, seen)
+
+
+def taken(
+    state: HistoryState,
+    mean: Array,
+    cov: Array,
+    measurement: Measurement,
+    known: Array,
+    info: Info,
+) -> tuple[HistoryState, Info]:
+    """The state with this mean and covariance if the measurement is `known` to be young enough,
+    present, and not refused by `info`, which gets its delay and status."""
+    late, present = measurement.time < state.time, jnp.any(measurement.mask)
+    good = info.status == Status.USED
+    new = state._replace(mean=mean, cov=cov, used=jnp.asarray(True))
+    status = verdict(late, present, Status.LATE_USED, good)
+    info = info._replace(delay=state.time - measurement.time, status=status)
+    return choose(known & present & good, new, state), too_late(info, ~known)
 
 
 def too_late(info: Info, refused: Array) -> Info:

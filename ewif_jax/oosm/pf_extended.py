@@ -110,11 +110,7 @@ def pf_extended(
         used = state.used | form.was_used(info)
         return state._replace(log_weights=log_weights, key=key, used=used), info
 
-    def estimate(params: Any, state: PathState) -> Gaussian:
-        del params
-        return form.summary(state)
-
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, form.estimate)
 
 
 def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:

@@ -10,6 +10,7 @@ from ewif_jax import checks
 from ewif_jax.forms import particles as form
 from ewif_jax.forms.covariance import CovarianceState
 from ewif_jax.forms.fixed_point import Conditional, fixed_point, given
+from ewif_jax.forms.innovations import numbers
 from ewif_jax.forms.particle_smoother import lines, look_back
 from ewif_jax.forms.particles import Seen
 from ewif_jax.forms.sigma_points import SigmaPoints, transform
@@ -63,13 +64,15 @@ def pf_fixed_point(
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. R must be
-            positive definite, and for "ps" Q too.
+            positive definite, and for "ps" Q too (a singular Q has no density: every late
+            measurement is then `REJECTED`).
         particles: N >= 2.
         lag: how many in-sequence measurements are stored, >= 1, each with the mean and covariance
             after it: what the state holds does not grow with lag times N. A measurement older than
             all of them, or than t0, is `TOO_LATE`.
         smoother: "eks", "uks" or "ps".
-        smoother_particles: M >= 2 for "ps"; default N / 10.
+        smoother_particles: M >= 2 for "ps"; default N / 10. They are resampled (systematic) where
+            fewer than M / 2 of them count, whatever `resampling` says of the filter's own.
         resampling, ess_threshold: as in `bootstrap`.
         collapse: as in `pf_retrodict`.
         ut_alpha, ut_beta, ut_kappa: of "uks", as in `unscented`. The paper has 1e-3, 2 and 0, which
@@ -89,7 +92,10 @@ def pf_fixed_point(
             without a key or a prior.
 
     Deviations: as in the two smoothers. A late measurement in the last interval sees x(k) as a
-        measurement of x(tau), not of x(k-1) as Remark 2 prints.
+        measurement of x(tau), not of x(k-1) as Remark 2 prints. The measurement (40)-(42) of
+        y(k-1) and x(k) together is taken as an update with y(k-1), after which the motion to k is
+        made linear around the updated state (the same for linear models). "uks" has sigma points
+        in the smoother; the integral (27)-(29) is by the Jacobian of h for both.
     """
     kind = form.cloud(model, particles, resampling, ess_threshold)
     collapse = form.collapse_factor(collapse)
@@ -113,10 +119,6 @@ def pf_fixed_point(
         )
         past, measured = jax.tree.map(lambda x: jnp.stack([x] * slots), (known, nothing))
         return SummaryState(*first, past, measured)
-
-    def predict(params: Any, state: SummaryState, time: Array) -> SummaryState:
-        time = jnp.asarray(time, state.time.dtype)
-        return form.leave(state, time, lambda s: form.step_ahead(kind, params, s, time)[0])
 
     def update(
         params: Any, state: SummaryState, measurement: Measurement
@@ -143,11 +145,7 @@ def pf_fixed_point(
         weighed = state._replace(log_weights=log_weights, key=key)
         return _remembered(weighed, measurement, form.was_used(info)), info
 
-    def estimate(params: Any, state: SummaryState) -> Gaussian:
-        del params
-        return form.summary(state)
-
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate)
 
 
 def _size(model: Model, params: Any, at: CovarianceState) -> int:
@@ -162,20 +160,21 @@ def _look_through(
     """A late measurement as it is seen by particles now, through the state at its time."""
     time, value, sensor, mask = measurement
 
-    def one(x: Array) -> tuple[Array, Array, Array]:
+    def one(x: Array) -> tuple[Array, Array, Array, Array]:
         there = given(past, x)
         predicted, H, R = sight(model, params, there.mean, sensor, time)
         checks.shape("measurement.value", value, (R.shape[0],))
-        difference = model.residual(value, predicted, sensor)
-        innovation = gaussian.innovate(difference, H, matmul(matmul(H, there.cov), H.T) + R, mask)
-        return innovation.value, innovation.cov, gaussian.log_density(innovation, mask)
+        difference = jnp.where(mask, model.residual(value, predicted, sensor), 0)
+        cov = gaussian.mask_cov(matmul(matmul(H, there.cov), H.T) + R, mask)
+        good = numbers(difference, cov, mask)
+        difference, cov = jnp.where(good, difference, 0), jnp.where(good, cov, R)
+        innovation = gaussian.innovate(difference, H, cov, mask)
+        return difference, innovation.cov, gaussian.log_density(innovation, mask), good
 
-    difference, cov, log_density = jax.vmap(one, -1, -1)(state.particles)
-    good = jnp.isfinite(log_density)
-    weights = jnp.where(good, jnp.exp(state.log_weights), 0)
-    innovation, spread = form.moments(jnp.where(good[None], difference, 0), weights)
-    innovation_cov = jnp.where(good[None, None], cov, 0) @ weights + spread
-    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, innovation_cov)
+    difference, cov, log_density, good = jax.vmap(one, -1, -1)(state.particles)
+    weights = jnp.exp(state.log_weights)
+    innovation, spread = form.moments(difference, jnp.where(good, weights, 0))
+    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, cov @ weights + spread)
 
 
 def _remembered(state: SummaryState, measurement: Measurement, used: Array) -> SummaryState:

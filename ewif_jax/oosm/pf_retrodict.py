@@ -58,10 +58,6 @@ def pf_retrodict(
         del params
         return form.draw(kind, "pf_retrodict", prior, t0, key)
 
-    def predict(params: Any, state: ParticleState, time: Array) -> ParticleState:
-        time = jnp.asarray(time, state.time.dtype)
-        return form.leave(state, time, lambda s: form.step_ahead(kind, params, s, time)[0])
-
     def update(
         params: Any, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
@@ -78,8 +74,4 @@ def pf_retrodict(
         log_weights, info = form.weigh(state, seen, measurement, True, collapse)
         return state._replace(log_weights=log_weights, key=key), info
 
-    def estimate(params: Any, state: ParticleState) -> Gaussian:
-        del params
-        return form.summary(state)
-
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, step
+from ewif_jax.estimator import advance, choose
 from ewif_jax.forms.partial_use import partly
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -85,7 +85,9 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         def one(at: Any, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
             measured, share = entry
             cut = measured._replace(value=measured.value[:size], mask=measured.mask[:size])
-            return step(estimator if share is None else partly(estimator, share), params, at, cut)
+            method = estimator if share is None else partly(estimator, share)
+            moved = advance(method, params, at, cut)
+            return moved.kept, moved.info
 
         oldest, rest = (jax.tree.map(lambda x, k=k: x[k], sorted_in) for k in (0, slice(1, None)))
         base, first = one(state.base, oldest)

@@ -6,13 +6,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import choose
 from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model, flow, sight
-from ewif_jax.oosm.history import HistoryState, last_before, one_step, too_late
-from ewif_jax.types import Estimator, Info, Measurement, Status
+from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
+from ewif_jax.types import Estimator, Info, Measurement
 
 
 class Tie(NamedTuple):
@@ -73,19 +74,9 @@ def rts_reference(model: Model, lag: int) -> Estimator:
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         R = R + matmul(matmul(H, symmetric.unpack(tie.cov)), H.T)
         difference = model.residual(measurement.value, predicted, measurement.sensor)
-        mean, cov, innovation = gaussian.update(
-            state.mean, state.cov, difference, matmul(H, tie.A), R, measurement.mask
-        )
-        updated = state._replace(mean=mean, cov=cov, used=jnp.asarray(True))
-        late, present = measurement.time < state.time, jnp.any(measurement.mask)
-        info = Info(
-            innovation.value,
-            innovation.cov,
-            gaussian.log_density(innovation, measurement.mask),
-            state.time - measurement.time,
-            verdict(late, present, Status.LATE_USED),
-        )
-        return choose(known & present, updated, state), too_late(info, ~known)
+        seen = Compared(difference, matmul(H, tie.A), R, measurement.mask)
+        mean, cov, info = updated(model, state.mean, state.cov, seen)
+        return taken(state, mean, cov, measurement, known, info)
 
     return form._replace(update=update)
 

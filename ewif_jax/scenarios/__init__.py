@@ -14,6 +14,7 @@ from ewif_jax.scenarios.arrowhead import (
     arrowhead_path,
     arrowhead_state,
 )
+from ewif_jax.scenarios.divergence import divergence, divergence_curve, divergence_filter
 from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
 from ewif_jax.scenarios.turn import turn, turn_model, turn_state
@@ -30,6 +31,9 @@ __all__ = [
     "arrowhead_model",
     "arrowhead_path",
     "arrowhead_state",
+    "divergence",
+    "divergence_curve",
+    "divergence_filter",
     "random_walk",
     "random_walk_model",
     "sine",

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
@@ -21,48 +22,87 @@ class Delivery(NamedTuple):
 
 
 def regular_times(interval: Any, steps: int, start: Any = 0.0) -> Array:
-    """(T,) start, start + interval, ... in seconds."""
+    """(T,) start, start + interval, ... in seconds.
+
+    Raises:
+        ValueError: interval <= 0; steps < 1.
+    """
     checks.positive("interval", interval)
     steps = checks.whole("steps", steps, 1)
     return start + interval * jnp.arange(steps)
 
 
 def poisson_times(key: Array, mean_interval: Any, steps: int, start: Any = 0.0) -> Array:
-    """(T,) the events of a Poisson process of rate 1 / mean_interval after `start`, seconds."""
+    """(T,) the events of a Poisson process of rate 1 / mean_interval after `start`, seconds.
+
+    Raises:
+        ValueError: mean_interval <= 0; steps < 1.
+    """
     checks.positive("mean_interval", mean_interval)
     steps = checks.whole("steps", steps, 1)
     return start + jnp.cumsum(mean_interval * jax.random.exponential(key, (steps,)))
 
 
 def exponential_delays(key: Array, mean: Any, steps: int) -> Array:
-    """(T,) exponentially distributed delays in seconds; `mean` may be () or (T,), zero included."""
+    """(T,) exponentially distributed delays in seconds; `mean` may be () or (T,), zero included.
+
+    Raises:
+        ValueError: a negative mean; steps < 1.
+    """
     checks.at_least("mean", mean, 0.0)
     return mean * jax.random.exponential(key, (checks.whole("steps", steps, 1),))
 
 
 def uniform_delays(key: Array, low: Any, high: Any, steps: int) -> Array:
-    """(T,) delays uniform in [low, high), seconds; the bounds may be () or (T,)."""
+    """(T,) delays uniform in [low, high), seconds; the bounds may be () or (T,).
+
+    Raises:
+        ValueError: low < 0; high < low; steps < 1.
+    """
     checks.at_least("low", low, 0.0)
     checks.at_least("high - low", jnp.asarray(high) - jnp.asarray(low), 0.0)
     return low + (high - low) * jax.random.uniform(key, (checks.whole("steps", steps, 1),))
 
 
 def fixed_delays(delay: Any, steps: int) -> Array:
-    """(T,) the same delay for all, seconds; `delay` may be () or (T,)."""
+    """(T,) the same delay for all, seconds; `delay` may be () or (T,).
+
+    Raises:
+        ValueError: a negative delay; steps < 1.
+    """
     checks.at_least("delay", delay, 0.0)
     return jnp.broadcast_to(jnp.asarray(delay), (checks.whole("steps", steps, 1),))
 
 
 def by_sensor(table: Any, sensor: Array) -> Array:
     """(T,) the entry of `table` (S,) that belongs to each measurement's sensor: per-sensor means,
-    bounds or delays for the functions above."""
+    bounds or delays for the functions above.
+
+    Raises:
+        ValueError: a table that is not (S,); a known sensor outside 0..S-1. (Inside a trace such a
+            sensor gives NaN.)
+    """
     checks.shape("table", table, ("S",))
-    return jnp.asarray(table)[sensor]
+    known = checks.known(sensor)
+    if known is not None and known.size:
+        count = np.shape(table)[0]
+        checks.require(known.min() >= 0, "sensor", "an index >= 0", known.min())
+        checks.require(known.max() < count, "sensor", f"an index below {count}", known.max())
+    table = jnp.asarray(table)
+    table = table.astype(float_dtype(table))
+    return table.at[jnp.asarray(sensor)].get(mode="fill", fill_value=jnp.nan)
 
 
 def losses(key: Array, probability: Any, steps: int) -> Array:
-    """(T,) True for what never arrives, independently with `probability` () or (T,)."""
-    checks.at_least("probability", probability, 0.0)
+    """(T,) True for what never arrives, independently with `probability` () or (T,).
+
+    Raises:
+        ValueError: a probability outside [0, 1]; steps < 1.
+    """
+    known = checks.known(probability)
+    if known is not None:
+        inside = np.all((known >= 0) & (known <= 1))
+        checks.require(inside, "probability", "a number between 0 and 1", probability)
     return jax.random.bernoulli(key, probability, (checks.whole("steps", steps, 1),))
 
 

@@ -48,7 +48,7 @@ def rts(
         x_{k|T} &= x_{k|k} + G_k (x_{k+1|T} - x_{k+1|k}) \\
         P_{k|T} &= (I - G_k F_k) P_{k|k} (I - G_k F_k)' + G_k (P_{k+1|T} + Q_k) G_k'
 
-    Rauch, Tung & Striebel (1965); Pornsarayouth & Yamakita (91)-(94), backward through a forward
+    Rauch, Tung & Striebel (1965); Pornsarayouth & Yamakita (93)-(94), backward through a forward
     filter. Where the model is not linear, F is its Jacobian at the filtered mean ("extended"), or
     the slope that sigma points of the filtered estimate give it, with what that leaves over in Q
     ("unscented"): then :math:`P_{k|k} F_k'` is the unscented cross-covariance, and this is the

@@ -71,7 +71,8 @@ def run(experiment: Experiment) -> None:
         ["A compiled program with a fixed buffer does the same work whatever it drops. What the",
          "limit saves is the buffer: run time is that of a program whose buffer just covers it,",
          "per measurement, all runs in one batch. Steps filtered again is what a program without",
-         "fixed shapes would have to do."],
+         "fixed shapes would have to do.",
+         "With everything used the expectation is 15.79 ± 0.04 m; 30 runs scatter around it."],
     )  # fmt: skip
     experiment.finish()
 

@@ -1,18 +1,34 @@
 """What a paper says and what we find, with the standard error that decides between them."""
 
+import math
+from collections.abc import Iterable
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
 from ewif_jax.study.experiment import Measured
 
+SIGMAS = 2.0
+"""how many standard errors decide"""
+
 
 def ratio(squared: np.ndarray, other: np.ndarray) -> Measured:
     """Ratio of two RMSEs from mean squares (R,) of the same runs, with the standard error of their
-    joint scatter (delta method)."""
+    joint scatter (delta method); unknown from fewer than two runs."""
+    if squared.size < 2:
+        return Measured(math.nan, math.nan)
     value = float(np.sqrt(squared.mean() / other.mean()))
     apart = squared / squared.mean() - other / other.mean()
     return Measured(value, float(value * apart.std(ddof=1) / (2 * np.sqrt(apart.size))))
+
+
+def quotient(one: Measured, other: Measured) -> Measured:
+    """Of two independent numbers, with its standard error (delta method)."""
+    value = one.value / other.value
+    return Measured(
+        value, abs(value) * math.hypot(one.error / one.value, other.error / other.value)
+    )
 
 
 def share(events: np.ndarray) -> Measured:
@@ -24,14 +40,45 @@ def share(events: np.ndarray) -> Measured:
     return Measured(p, float(np.sqrt(safe * (1 - safe) / count)))
 
 
+def surest(ratios: Iterable[Measured]) -> Measured:
+    """The ratio that is above 1 by the most standard errors. Taken as one of T, it is beyond noise
+    if it is above by `at_any_of(T)`; if it is below 1, all are."""
+    return max(ratios, key=lambda one: (one.value - 1) / max(one.error, 1e-300))
+
+
+def at_any_of(count: int) -> float:
+    """How many standard errors make the surest of `count` numbers as sure as `SIGMAS` make one
+    (Bonferroni)."""
+    return -NormalDist().inv_cdf(NormalDist().cdf(-SIGMAS) / count)
+
+
 def claim(
-    text: str, published: str, ours: Measured, *, above: Any = None, below: Any = None
-) -> dict:
-    """A row of a table of claims: it holds if `ours` is above or below the limit by two standard
-    errors, does not if it is on the other side by as much, and else is "not beyond noise"."""
-    limit, sign = (above, 1) if below is None else (below, -1)
-    margin = sign * (ours.value - limit)
-    sure = 2 * ours.error
+    text: str,
+    published: str,
+    ours: Measured,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+    sigmas: float = SIGMAS,
+    reason: str = "",
+) -> dict[str, Any]:
+    """A row of a table of claims: it holds if `ours` is between the limits by `sigmas` standard
+    errors, does not if it is beyond one of them by as much, and else is "not beyond noise". Where
+    it does not hold, the row says why: `reason`, or else that it is undecided or unexplained."""
+    margin = min(ours.value - above, below - ours.value)
+    sure = sigmas * ours.error
     holds = "yes" if margin > sure else "no" if margin < -sure else "not beyond noise"
-    test = f"{'>' if sign > 0 else '<'} {limit:g}"
-    return {"claim": text, "published": published, "ours": ours, "holds if": test, "holds": holds}
+    default = {"yes": "", "no": "unexplained", "not beyond noise": "too few runs to tell"}[holds]
+    test = f"> {above:g}" if below == math.inf else f"< {below:g}"
+    if above > -math.inf and below < math.inf:
+        test = f"{above:g} to {below:g}"
+    if sigmas != SIGMAS:
+        test += f" by {sigmas:.2g} s.e."
+    return {
+        "claim": text,
+        "published": published,
+        "ours": ours,
+        "holds if": test,
+        "holds": holds,
+        "reason": default if holds == "yes" else reason or default,
+    }

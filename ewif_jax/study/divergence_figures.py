@@ -5,16 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from ewif_jax.study.figures import (
-    EWIF,
-    KALMAN,
-    MEASURED,
-    OTHER,
-    TRUTH,
-    canvas,
-    label,
-    plain_ticks,
-)
+from ewif_jax.study.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label, plain_ticks
 
 COLOR = {"none": TRUTH, "noise": KALMAN, "weighting": EWIF, "memory": OTHER}
 STYLE = {"none": "-", "noise": (0, (4, 4)), "weighting": "-", "memory": "-"}

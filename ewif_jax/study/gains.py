@@ -15,7 +15,7 @@ from ewif_jax.scenarios.delays import poisson_times
 from ewif_jax.study import gains_figures as figures
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.late import mean_of
-from ewif_jax.study.late_loss import losses
+from ewif_jax.study.late_loss import relative_errors
 
 SETTLING = 400
 AGES = (0, 1, 2, 4, 8)
@@ -101,9 +101,10 @@ def run(experiment: Experiment) -> None:
          "fresh: average gain of the newest measurement, and the closed form's."],
     )  # fmt: skip
     with experiment.timed("one late measurement"):
-        lost = losses()
+        compared = relative_errors()
     experiment.table(
-        "late_loss", "One late measurement: expected mean square error over the exact one", lost,
+        "late_loss", "One late measurement: expected mean square error over the exact one",
+        compared,
         ["Position, settled filter, q = r = 1, a measurement every second; the late one is of the",
          "middle of an interval. a1 and b1 take nothing from more than one update time back."],
     )  # fmt: skip

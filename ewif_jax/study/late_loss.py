@@ -72,7 +72,7 @@ def sources(model: Model, n: int, times: np.ndarray) -> tuple[np.ndarray, np.nda
     return state, seen
 
 
-def losses() -> list[dict[str, Any]]:
+def relative_errors() -> list[dict[str, Any]]:
     """Rows of a table: the expected mean square error of each method over that of the exact answer,
     and Al1's computed variance over its true one, all of the position."""
     rows = []

@@ -10,11 +10,14 @@ from jax.sharding import Mesh, PartitionSpec
 
 from ewif_jax.estimator import Clock, run
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.study.experiment import Measured
 from ewif_jax.study.folder import Arrays
 from ewif_jax.study.timing import timed
 from ewif_jax.types import Estimator, Measurement, Trace
 
 Observe = Callable[[Trace, Simulation], Mapping[str, Any]]
+PARTS = 5
+"""how many parts of a batch are timed, so that times have standard errors"""
 
 
 def over_cores(compute: Callable[..., Any]) -> Callable[..., Any]:
@@ -43,7 +46,8 @@ def tracker(
     estimator: Estimator, scenario: Scenario, observe: Observe, clock: Clock | None = None
 ) -> Callable[[Simulation, Any], Arrays]:
     """(simulations (R, ...), keys (R,)) -> what `observe` keeps of each run, and "core_seconds"
-    (R,): time on one core without compiling, the same for all."""
+    (R,): time on one core without compiling, the same for all runs of one of `PARTS` equal parts.
+    """
 
     def track(simulation: Simulation, key: Any) -> Mapping[str, Any]:
         trace = run(
@@ -55,13 +59,27 @@ def tracker(
     program = over_cores(track)
 
     def call(simulations: Simulation, keys: Any) -> Arrays:
-        runs = keys.shape[0]
-        with timed() as timing:
-            found = program(simulations, keys)
-        busy = timing.run * min(len(jax.local_devices()), runs) / runs
-        return {**found, "core_seconds": np.full(runs, busy)}
+        runs, cores = keys.shape[0], len(jax.local_devices())
+        size = -(-runs // (min(PARTS, runs) * cores)) * cores
+        found = []
+        for begin in range(0, runs, size):
+            # equal parts (the last padded) are compiled once
+            index = np.minimum(np.arange(begin, begin + size), runs - 1)
+            some = jax.tree.map(lambda x, i=index: x[i], (simulations, keys))
+            with timed() as timing:
+                part = program(*some)
+            found.append({**part, "core_seconds": np.full(size, timing.run * cores / size)})
+        return {name: np.concatenate([x[name] for x in found])[:runs] for name in found[0]}
 
     return call
+
+
+def seconds_per_run(core_seconds: np.ndarray) -> Measured:
+    """Mean (R,) with the standard error that the scatter of the parts timed separately gives;
+    unknown from one."""
+    parts = np.unique(core_seconds)
+    error = np.std(parts, ddof=1) / np.sqrt(parts.size) if parts.size > 1 else np.nan
+    return Measured(float(core_seconds.mean()), float(error))
 
 
 def per_run(simulation: Simulation) -> Simulation:

@@ -97,7 +97,9 @@ def run(experiment: Experiment) -> None:
         "random_walk", f"Random walk, {runs} runs of {steps} measurements: RMSE [m]",
         [_methods(case, one) for case, one in zip(CASES, found, strict=True)],
         ["exact: all measurements in order of validity time, at a part of the arrivals.",
-         "EWIF: all measurements, τ by gradient on other runs, start of the walk not told."],
+         "EWIF: all measurements, τ by gradient on other runs, start of the walk not told.",
+         "4a varies most: dropping what is late has the expectation 6.04 ± 0.04 (2,000 runs of",
+         "5,000), and a table of 40 such runs a standard error of 0.25."],
     )  # fmt: skip
     experiment.finish()
 

@@ -1,5 +1,5 @@
-"""tau, q and the cut-off learned together, by gradient through late measurements: the arrowhead
-of Yoder et al. again."""
+"""A cut-off learned together with q of Al1, and with tau of the EWIF, by gradient through late
+measurements: the arrowhead of Yoder et al. again."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -87,7 +87,9 @@ def run(experiment: Experiment) -> None:
         f"{steps}", rows,
         [f"The gradient sees a cut-off softened by {SOFTNESS:g} s, on training runs; delays are "
          "whole seconds.",
-         "published: q and T_stale of the paper, and the τ of the same gain without a cut-off."],
+         "published: q and T_stale of the paper, and the τ of the same gain without a cut-off.",
+         "Two separate searches: (q, cut-off) of Al1 and (τ, cut-off) of the EWIF. No method has",
+         "both a q and a τ."],
     )  # fmt: skip
     experiment.finish()
 

@@ -11,11 +11,12 @@ from ewif_jax.analysis.storage import storage
 from ewif_jax.monte_carlo import Simulation
 from ewif_jax.study import turn_figures as figures
 from ewif_jax.study import turn_runs as runs_of
-from ewif_jax.study.claims import claim, ratio, share
+from ewif_jax.study.claims import at_any_of, claim, quotient, ratio, share, surest
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.folder import Arrays
 from ewif_jax.study.late import mean_of, rmse
 from ewif_jax.study.late_methods import storage_rows
+from ewif_jax.study.one_by_one import seconds_per_run
 from ewif_jax.study.turn_runs import (
     EKF,
     EKS,
@@ -26,11 +27,14 @@ from ewif_jax.study.turn_runs import (
     PS,
     STD,
     TIMES,
+    UKF,
     UKS,
     Method,
 )
 
-SETTLED, LOST = 5, 500.0
+SETTLED, LATER, LOST = 5, 20, 500.0
+SECONDS = TIMES.size - SETTLED
+"""how many seconds are compared one by one"""
 BLOCK = 200
 """how many runs an interrupted study may have to repeat"""
 
@@ -63,12 +67,15 @@ def run(experiment: Experiment) -> None:
         "turn", f"Coordinated turn, {runs} runs, t >= {SETTLED} s",
         _rows(found, held),
         [f"{EXACT}: of {found[EXACT]['position'].shape[0]} runs, relative to {EKS} on the same.",
-         "s/run: on one core, one run after the other, without compiling."],
+         "s/run: on one core, one run after the other, without compiling.",
+         runs_of.sigma_points_note()],
     )  # fmt: skip
     experiment.table(
         "claims", "What the paper says", claims(found, bound, held),
         ["The parametric bound is that of a steady turn. Bounds of noisy motion hold on average",
-         "over targets that the noise drives: on this one smooth path a filter may be better."],
+         "over targets that the noise drives: on this one smooth path a filter may be better.",
+         "The surest second: of the 26 from 5 s on, the one with most standard errors above 1,",
+         "which have to be as many as make a chance hit in any of them as rare as in one row."],
     )  # fmt: skip
     experiment.finish()
 
@@ -94,45 +101,64 @@ def overall(found: dict[str, Arrays], kind: str = "position") -> dict[str, Measu
 
 
 def claims(found: dict[str, Arrays], bound: Arrays, held: dict[str, int]) -> list[dict[str, Any]]:
-    """What the paper says about its filters."""
+    """What the paper says about its filters, and one comparison that it does not make."""
 
     def against(name: str, other: str, kind: str = "position") -> Measured:
         runs = min(found[name][kind].shape[0], found[other][kind].shape[0])
         return ratio(settled(found[name], kind)[:runs], settled(found[other], kind)[:runs])
 
-    late = found[PS]["late_used"].mean()
-    in_sequence = found[STD]["core_seconds"].mean() / TIMES.size
-    smoother = (found[PS]["core_seconds"].mean() - found[STD]["core_seconds"].mean()) / late
+    def lost(name: str) -> Measured:
+        return share(found[name]["position"][:, LATER:].max(1) > LOST**2)
+
     floor = np.sqrt(np.mean(bound["parametric_velocity"][SETTLED:]))
     velocity = rmse(settled(found[ORD], "velocity"))
-    lost = found[EKF]["position"][:, SETTLED:].max(1) > LOST**2
+    storing = Measured((held[EXT] - held[STD]) / (held[EKS] - held[STD]), 0.0)
+    alike = "what uses late data differs by 1 to 3 %, which only many runs tell"
+    again = ("it is further off early, and is back by then; the discretisation of the model is not"
+             " printed")  # fmt: skip
+    table = ("a density for every pair of its particles and those of the filter, which the paper"
+             " does not count")  # fmt: skip
     return [
         claim("PFord over PFoosmEKS (position)", "PFord is best", against(ORD, EKS), below=1),
         claim("PFoosmEKS over PFstd (position)", "late data help", against(EKS, STD), below=1),
-        claim("PFoosmEKS over PFoosmEXT (position)", "comparable", against(EKS, EXT), below=1.05),
-        claim("PFoosmEKS over PFoosmUKS (position)", "EKS is best", against(EKS, UKS), below=1),
-        claim("PFoosmPS over PFoosmEKS (position)", "slightly worse", against(PS, EKS), above=1),
-        claim("PFoosmUKS over PFstd, velocity, its worst second", "at times worse",
-              _worst_second(found[UKS], found[STD]), above=1),
+        claim("PFoosmEKS over PFoosmEXT (position)", "comparable", against(EKS, EXT),
+              above=0.95, below=1.05),
+        claim("PFoosmEKS over PFoosmEXT (position)", "EKS is best", against(EKS, EXT), below=1,
+              reason=alike),
+        claim("PFoosmEKS over PFoosmUKS (position)", "EKS is best", against(EKS, UKS), below=1,
+              reason=alike),
+        claim("PFoosmPS over PFoosmEKS (position)", "slightly worse", against(PS, EKS), above=1,
+              reason=alike),
+        claim("PFoosmUKS over PFstd, velocity, the surest second", "at times worse",
+              _surest_second(found[UKS], found[STD]), above=1, sigmas=at_any_of(SECONDS)),
+        claim("PFoosmEKS over PFstd, velocity, the surest second", "not said",
+              _surest_second(found[EKS], found[STD]), above=1, sigmas=at_any_of(SECONDS)),
         claim("PFord over the parametric bound without late data (velocity)", "cannot beat it",
               Measured(velocity.value / floor, velocity.error / floor), above=1),
-        claim("runs in which the EKF is 500 m off after 5 s (share)", "failed to converge",
-              share(lost), above=0.5),
+        *(row for name in (EKF, UKF) for row in (
+            claim(f"{name} over PFstd (position)", "not a rival", against(name, STD), above=1),
+            claim(f"runs in which the {name} is {LOST:g} m off after {LATER} s (share)",
+                  "failed to converge", lost(name), above=0.5, reason=again))),
         claim("numbers kept for late data: PFoosmEXT over PFoosmEKS", "much less storage",
-              Measured((held[EXT] - held[STD]) / (held[EKS] - held[STD]), 0.0), above=100),
+              storing, above=100),
         claim("cost of a late measurement in PFoosmPS over that of an ordinary step",
-              "about half", Measured(smoother / in_sequence, 0.0), below=0.5),
+              "about half", _smoother_cost(found[PS], found[STD]), below=0.75, reason=table),
         claim("PFoosmEKS over exact replay (position)", "not tried", against(EKS, EXACT),
-              below=1.05),
+              above=0.95, below=1.05),
     ]  # fmt: skip
 
 
-def _worst_second(found: Arrays, other: Arrays) -> Measured:
-    """The largest ratio of the RMS velocity errors of two filters in any second."""
-    ratios = [
-        ratio(found["velocity"][:, k], other["velocity"][:, k]) for k in range(SETTLED, TIMES.size)
-    ]
-    return max(ratios, key=lambda one: one.value)
+def _surest_second(found: Arrays, other: Arrays) -> Measured:
+    """The ratio of the RMS velocity errors of two filters where it is above 1 most surely."""
+    kind = "velocity"
+    return surest(ratio(found[kind][:, -k], other[kind][:, -k]) for k in range(1, SECONDS + 1))
+
+
+def _smoother_cost(late: Arrays, in_sequence: Arrays) -> Measured:
+    """Time that a filter takes for a late measurement, in steps of the filter that drops them."""
+    whole = quotient(*(seconds_per_run(x["core_seconds"]) for x in (late, in_sequence)))
+    steps = TIMES.size / late["late_used"].mean()
+    return Measured((whole.value - 1) * steps, whole.error * steps)
 
 
 def _tracked(
@@ -170,7 +196,7 @@ def _rows(found: dict[str, Arrays], held: dict[str, int]) -> list[dict[str, Any]
             "velocity RMS [m/s]": velocity[name],
             "late used": float(one["late_used"].mean()),
             "rejected per run": mean_of(one["rejected"].astype(float)),
-            "s/run": float(one["core_seconds"].mean()),
+            "s/run": seconds_per_run(one["core_seconds"]),
             "numbers stored": held[name],
         }
         for name, one in found.items()

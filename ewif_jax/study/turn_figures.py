@@ -19,6 +19,8 @@ LOOK = {
     "PFoosmPS": ("#7b3294", "--"),
     "exact replay": (TRUTH, "-"),
 }
+GIVEN_UP = {"EKF": ("#f4a582", ":"), "UKF": ("#92c5de", ":")}
+"""which the paper did not run to the end"""
 UNITS = {"position": "m", "velocity": "m/s"}
 
 
@@ -45,7 +47,7 @@ def rms(
     """Figs. 3 and 4: RMS error against time, with bounds."""
     figure, axes = canvas(width=11, height=5.5)
     time = np.arange(31.0)
-    for name, (color, style) in LOOK.items():
+    for name, (color, style) in (LOOK | GIVEN_UP).items():
         if len(found[name][kind]) < len(found["PFstd"][kind]) and len(found[name][kind]) < 100:
             continue  # too few runs for a curve of its own
         mean = found[name][kind].mean(0)

@@ -27,6 +27,8 @@ STD, ORD, EXT, EXACT = "PFstd", "PFord", "PFoosmEXT", "exact replay"
 EKS, UKS, PS = "PFoosmEKS", "PFoosmUKS", "PFoosmPS"
 EKF, UKF = "EKF", "UKF"
 TIMES = np.arange(SECONDS + 1.0)
+PRINTED = {"ut_alpha": 1e-3, "ut_beta": 2.0, "ut_kappa": 0.0}
+"""sigma points of the paper"""
 
 
 class Method(NamedTuple):
@@ -40,24 +42,33 @@ class Method(NamedTuple):
 
 def methods(particles: int = 10_000) -> dict[str, Method]:
     """The six filters of the paper, the exact answer of the particle filter, and the two filters
-    that the paper gave up."""
+    that the paper gave up. Its sigma points need float64; in float32 those of the cubature rule
+    take their place."""
     model = turn_model()
     in_sequence = bootstrap(model, particles)
+    points = PRINTED if _as_printed() else {}
 
-    def smoothing(smoother: Any) -> Method:
-        return Method(pf_fixed_point(model, particles, LAG, smoother))
+    def smoothing(smoother: Any, **setting: Any) -> Method:
+        return Method(pf_fixed_point(model, particles, LAG, smoother, **setting))
 
     return {
         STD: Method(drop_late(in_sequence)),
         ORD: Method(in_sequence, in_order=True),
         EXT: Method(pf_extended(model, particles, LAG)),
         EKS: smoothing("eks"),
-        UKS: smoothing("uks"),
+        UKS: smoothing("uks", **points),
         PS: smoothing("ps"),
         EXACT: Method(replay(in_sequence, BUFFER, width=2), share=0.1),
         EKF: Method(extended(model)),
-        UKF: Method(unscented(model)),
+        UKF: Method(unscented(model, **points)),
     }
+
+
+def sigma_points_note() -> str:
+    """Which sigma points `methods` uses."""
+    if _as_printed():
+        return "PFoosmUKS and UKF: sigma points as printed, alpha = 1e-3, beta = 2, kappa = 0."
+    return "PFoosmUKS and UKF: cubature points; float32 cannot carry the printed alpha = 1e-3."
 
 
 def simulated(key: Any, runs: int) -> dict[bool, Simulation]:
@@ -106,6 +117,10 @@ def bounds(batch: Simulation) -> Arrays:
         for begin, part in parts.items()
         for kind, x in found.items()
     }
+
+
+def _as_printed() -> bool:
+    return jnp.zeros(()).dtype == jnp.float64
 
 
 @cache

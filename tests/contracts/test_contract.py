@@ -205,8 +205,7 @@ def test_gradient_is_finite_and_the_finite_difference(row):
 
     built(row)  # its constants must not belong to the trace below
     params = {name: jnp.asarray(value) for name, value in PARAMS.items()}
-    quick = jax.jit(both_modes, compiler_options={"xla_backend_optimization_level": 0})
-    reverse, forward = quick(params)
+    reverse, forward = jax.jit(both_modes)(params)
     h = 1e-5
     for name, value in PARAMS.items():
         up, down = (loss({**PARAMS, name: value + shift}) for shift in (h, -h))
@@ -227,6 +226,35 @@ def test_padding_is_a_no_op(row):
     assert info.status == Status.MASKED
     assert info.log_likelihood == 0
     np.testing.assert_array_equal(info.innovation, 0)
+
+
+@each
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+@pytest.mark.parametrize("age", [-0.2, 0.0, 0.4, 7.0])
+def test_what_is_not_a_number_is_rejected_and_changes_nothing(row, bad, age):
+    """In one component; 1e200 is a number, its square is not."""
+    state = streamed(row).states[6]
+    value = arrival(6).value.at[1].set(bad)
+    z = arrival(6)._replace(time=state.time - age, value=value)
+    after, info = built(row).step(PARAMS, state, z)
+    assert info.status == Status.REJECTED
+    assert identical(after, state)
+    assert info.log_likelihood == 0
+    assert all(np.isfinite(x).all() for x in info)
+    absent = z._replace(mask=jnp.asarray([True, False]))
+    _, info = built(row).step(PARAMS, state, absent)
+    assert info.status != Status.REJECTED
+    assert all(np.isfinite(x).all() for x in info)
+
+
+@each
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_time_that_is_not_a_number_is_rejected(row, bad):
+    state = streamed(row).states[6]
+    after, info = built(row).step(PARAMS, state, arrival(6)._replace(time=jnp.asarray(bad)))
+    assert info.status == Status.REJECTED
+    assert identical(after, state)
+    assert all(np.isfinite(x).all() for x in info)
 
 
 @each

@@ -55,8 +55,8 @@ def errors(name, members):
         trace = ej.run(estimator, None, data, prior=PROBLEM.prior, t0=0.0, key=key)
         return trace.mean, trace.cov
 
-    quick = jax.jit(jax.vmap(shown), compiler_options={"xla_backend_optimization_level": 1})
-    means, covs = map(np.asarray, quick(jax.random.split(jax.random.key(members), RUNS)))
+    batch = jax.jit(jax.vmap(shown))
+    means, covs = map(np.asarray, batch(jax.random.split(jax.random.key(members), RUNS)))
     mean, cov = limit(data, back)
     sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     return (means - mean) / sd, (covs - cov) / (sd[:, :, None] * sd[:, None, :])

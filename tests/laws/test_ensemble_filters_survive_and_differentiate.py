@@ -12,17 +12,20 @@ from ewif_jax.estimators.ensemble import ensemble
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.models import bearing_sensor, constant_velocity
 from ewif_jax.models.sensors import wrap_angle
+from ewif_jax.oosm.al1 import al1
+from ewif_jax.oosm.asd import asd
 from ewif_jax.oosm.enkf1 import enkf1
 from ewif_jax.oosm.enkf2 import enkf2
 from ewif_jax.oosm.rts_reference import rts_reference
 
 
 def world():
-    """Position along x and the bearing from the origin, in the plane."""
+    """Position along x and the bearing from the origin, in the plane; at one time, nothing."""
     base = constant_velocity(sensors=bearing_sensor(1.0), dims=2, q=lambda p: p["q"])
 
     def observe(params, x, sensor, t):
-        return jnp.concatenate([x[:1], base.observe(params, x, sensor, t)])
+        seen = jnp.concatenate([x[:1], base.observe(params, x, sensor, t)])
+        return jnp.where(t == params["blind"], jnp.nan, seen)
 
     def measurement_cov(params, sensor, t):
         return params["r"] * jnp.diag(jnp.array([1.0, 0.05]))
@@ -36,7 +39,10 @@ def world():
 
 MODEL = world()
 FILTERS = {
+    "extended": ej.extended(MODEL),
     "unscented": unscented(MODEL, ut_beta=2.0),
+    "al1": al1(MODEL, 3),
+    "asd": asd(MODEL, 3),
     "rts_reference": rts_reference(MODEL, 3),
     "two_members": ensemble(MODEL, 2),
     "fewer_members_than_states": ensemble(MODEL, 3, "square_root"),
@@ -44,8 +50,9 @@ FILTERS = {
     "enkf2": enkf2(MODEL, 3, 3),
     "enkf2_shared": enkf2(MODEL, 3, 3, "shared"),
 }
+IN_SEQUENCE_ONLY = ("extended", "unscented", "two_members", "fewer_members_than_states")
 each = pytest.mark.parametrize("name", FILTERS)
-PARAMS = {"q": 0.3, "r": 0.1}
+PARAMS = {"q": 0.3, "r": 0.1, "blind": -1.0}
 PRIOR = ej.Gaussian(np.array([-4.0, 0.1, 0.5, -0.2]), np.diag([0.5, 0.5, 0.1, 0.1]))
 AT_THE_SENSOR = ej.Gaussian(np.zeros(4), np.zeros((4, 4)))
 STREAM = ej.stream(
@@ -66,10 +73,7 @@ def both(name):
         value = jnp.sum(trace.mean**2) + jnp.sum(trace.cov) + jnp.sum(trace.info.log_likelihood)
         return value, (trace.mean, trace.cov, trace.info)
 
-    compiled = jax.jit(
-        jax.value_and_grad(loss, has_aux=True),
-        compiler_options={"xla_backend_optimization_level": 0},
-    )
+    compiled = jax.jit(jax.value_and_grad(loss, has_aux=True))
     return lambda params, prior, data: compiled(params, jax.tree.map(jnp.asarray, prior), data)
 
 
@@ -92,6 +96,47 @@ def test_everything_stays_finite_gradients_too(name, case):
         assert np.isfinite(x).all()
     if case == "all masked":
         assert np.all(shown[2].status == ej.Status.MASKED)
+
+
+def bad(value):
+    """In sequence and late, while the filter stands at one time."""
+    return STREAM._replace(value=STREAM.value.at[3:5, 0].set(value))
+
+
+NOT_NUMBERS = {
+    "NaN": (PARAMS, bad(np.nan), (3, 4)),
+    "infinite": (PARAMS, bad(np.inf), (3, 4)),
+    "square overflows": (PARAMS, bad(-1e200), (3, 4)),
+    "unseen in sequence": ({**PARAMS, "blind": 0.9}, STREAM, (4,)),
+    "unseen late": ({**PARAMS, "blind": 1.0}, STREAM, (6,)),
+    "unseen at a new time": ({**PARAMS, "blind": 1.4}, STREAM, (5,)),
+}
+
+
+@each
+@pytest.mark.parametrize("case", NOT_NUMBERS)
+def test_what_is_not_a_number_is_rejected_within_a_run(name, case):
+    """Gradients stay finite, and what comes after is used as ever."""
+    params, data, where = NOT_NUMBERS[case]
+    (_, (mean, cov, info)), slope = both(name)(params, PRIOR, data)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((mean, cov, info, slope)))
+    late = info.delay > 0
+    expected = np.where(late, ej.Status.LATE_USED, ej.Status.USED)
+    expected[list(where)] = ej.Status.REJECTED
+    if case == "unseen in sequence":
+        expected[2] = ej.Status.REJECTED
+    if name in IN_SEQUENCE_ONLY:
+        expected[late] = ej.Status.TOO_LATE
+    np.testing.assert_array_equal(info.status, expected)
+    np.testing.assert_array_equal(info.log_likelihood != 0, expected < ej.Status.TOO_LATE)
+    for k in where:
+        if data.time[k] <= data.time[:k].max():
+            np.testing.assert_array_equal(mean[k], mean[k - 1])
+            np.testing.assert_array_equal(cov[k], cov[k - 1])
+        else:
+            at, velocity = mean[k - 1][:2], mean[k - 1][2:]
+            predicted = [*(at + velocity * (STREAM.time[k] - STREAM.time[k - 1])), *velocity]
+            np.testing.assert_allclose(mean[k], predicted, rtol=1e-12)
 
 
 @each

@@ -20,12 +20,14 @@ SIGNAL = Signal(STAMPS, np.stack([np.sin(STAMPS)], 1))
 TIMES = np.array([0.5, 2.0, 5.25, 8.0])
 
 
-def expected(F_of, rate_of):
-    """(3-4), (3-5) with R_alpha, Q_alpha of (3-1): the weighted noises, nothing rescaled."""
+def expected(at, rate_of):
+    """(3-4), (3-5) with R_alpha, Q_alpha of (3-1): the weighted noises, nothing rescaled. at(t) is
+    F, G, H, Q, R."""
 
     def slope(t, y):
         mean, P, exponent = y[:2], y[2:6].reshape(2, 2), y[6]
-        F, fade = F_of(t), np.exp(-2 * exponent)
+        F, G, H, Q, R = at(t)
+        fade = np.exp(-2 * exponent)
         K = P @ H.T / (fade * R)
         z = np.interp(t, STAMPS, SIGNAL.value[:, 0])
         P_slope = P @ F.T + F @ P - K @ H @ P + fade * G @ Q @ G.T
@@ -40,7 +42,7 @@ def expected(F_of, rate_of):
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
 def test_constant_system(rate):
-    mean, cov = expected(lambda t: F, lambda t: rate)
+    mean, cov = expected(lambda t: (F, G, H, Q, R), lambda t: rate)
     system = ContinuousSystem(F, G, H, Q, R)
     ours = kalman_bucy(system, None, SIGNAL, prior=PRIOR, times=TIMES, fading_rate=rate)
     np.testing.assert_allclose(ours.mean, mean, rtol=1e-7, atol=1e-7)
@@ -48,13 +50,57 @@ def test_constant_system(rate):
 
 
 def test_everything_varies_with_time():
-    system = ContinuousSystem(lambda p, t: jnp.asarray(F) * (1 + p * jnp.sin(t)), G, H, Q, R)
-    mean, cov = expected(lambda t: F * (1 + 0.5 * np.sin(t)), lambda t: 0.1 * t)
+    """F, G, H, Q, R and alpha, each at its own pace."""
+    swings = (
+        np.array([[0.1, -0.2], [0.3, 0.2]]), np.array([[0.4], [-0.3]]), np.array([[0.3, 0.5]]),
+        np.array([[0.2]]), np.array([[-0.3]]),
+    )  # fmt: skip
+    base = F, G, H, Q, R
+
+    def matrix(k, xp):
+        return lambda p, t: base[k] + p * xp.sin((0.7 + 0.4 * k) * t) * swings[k]
+
+    system = ContinuousSystem(*(matrix(k, jnp) for k in range(5)))
+    mean, cov = expected(lambda t: [matrix(k, np)(0.8, t) for k in range(5)], lambda t: 0.1 * t)
     ours = kalman_bucy(
-        system, 0.5, SIGNAL, prior=PRIOR, times=TIMES, fading_rate=lambda p, t: 0.1 * t
+        system, 0.8, SIGNAL, prior=PRIOR, times=TIMES, fading_rate=lambda p, t: 0.1 * t
     )
     np.testing.assert_allclose(ours.mean, mean, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(ours.cov, cov, rtol=1e-7, atol=1e-8)
+
+
+def least_squares(rate, steps):
+    """The end of the path that minimises (2-8), e^(2 alpha t) times the squared residuals of the
+    start, of the input and of the measurement, on a grid of midpoints: one dense least squares."""
+    first, last = TIMES[0], TIMES[-1]
+    dt = (last - first) / steps
+    move, push = np.eye(2) + dt * F + dt**2 / 2 * F @ F, dt * (np.eye(2) + dt / 2 * F) @ G
+    middle = first + dt * (np.arange(steps) + 0.5)
+    z = np.interp(middle, STAMPS, SIGNAL.value[:, 0])
+    weight = np.exp(rate * (middle - first))
+    rows, right = np.zeros((2 + 2 * steps, 2 + steps)), np.zeros(2 + 2 * steps)
+    start = np.linalg.cholesky(np.linalg.inv(PRIOR.cov)).T
+    rows[:2, :2], right[:2] = start, start @ PRIOR.mean
+    state = np.eye(2, 2 + steps)
+    for k in range(steps):
+        after = move @ state
+        after[:, 2 + k] += push[:, 0]
+        looking = weight[k] * np.sqrt(dt / R[0, 0])
+        rows[2 + k], right[2 + k] = looking * (H @ (state + after) / 2)[0], looking * z[k]
+        rows[2 + steps + k, 2 + k] = weight[k] * np.sqrt(dt / Q[0, 0])
+        state = after
+    return state @ np.linalg.lstsq(rows, right, rcond=None)[0]
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_it_minimises_the_weighted_cost(rate):
+    """(2-8) on two grids, extrapolated to a step of 0, is the filter of (3-4), (3-5)."""
+    ours = kalman_bucy(
+        ContinuousSystem(F, G, H, Q, R), None, SIGNAL, prior=PRIOR, times=TIMES, fading_rate=rate
+    )
+    coarse, fine = least_squares(rate, 300), least_squares(rate, 600)
+    np.testing.assert_allclose((4 * fine - coarse) / 3, ours.mean[-1], atol=2e-4)
+    assert np.abs(fine - ours.mean[-1]).max() < 0.02
 
 
 def test_settles_in_the_steady_state():

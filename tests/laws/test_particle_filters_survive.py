@@ -19,6 +19,7 @@ LINE = constant_velocity(sensors=position_sensor(lambda p: p["r"]), q=lambda p: 
 PARAMS = {"q": jnp.asarray(0.3), "r": jnp.asarray(0.5)}
 DATA = ej.stream(np.array([1.0, 2.0, 1.5, 3.0]), np.array([11.0, 12.0, 11.4, 13.1]))
 LATE = 2
+REFUSED = (Status.TOO_LATE, Status.REJECTED)
 BUILD = {
     "bootstrap": bootstrap,
     "retrodict": pf_retrodict,
@@ -29,8 +30,10 @@ BUILD = {
 
 
 def measured(time, value):
+    """One component, present whatever its value."""
     value = jnp.atleast_1d(jnp.asarray(value))
-    return ej.Measurement(jnp.asarray(time), value, jnp.asarray(0, jnp.int32), value == value)
+    present = jnp.ones(value.shape, bool)
+    return ej.Measurement(jnp.asarray(time), value, jnp.asarray(0, jnp.int32), present)
 
 
 @pytest.mark.parametrize("name", BUILD)
@@ -50,15 +53,67 @@ def test_two_particles_and_no_process_noise(name):
     assert all(np.isfinite(x).all() for x in leaves)
 
 
-@pytest.mark.parametrize("value", [np.inf, 1e200])
-def test_a_measurement_that_no_particle_explains_is_rejected(value):
-    method = bootstrap(LINE, 100)
-    state = method.predict(PARAMS, method.init(PARAMS, PRIOR, 0.0, KEY), jnp.asarray(1.0))
-    after, info = jax.jit(method.update)(PARAMS, state, measured(1.0, value))
-    assert info.status == Status.REJECTED
-    assert info.log_likelihood == 0
-    np.testing.assert_array_equal(after.log_weights, state.log_weights)
-    assert np.isfinite(method.estimate(PARAMS, after).cov).all()
+@pytest.mark.parametrize("name", BUILD)
+def test_a_measurement_that_no_particle_explains_is_rejected(name):
+    """In sequence and late, in `update` itself, where nothing has looked at the value before; the
+    filter goes on, and gradients are finite."""
+    method = BUILD[name](LINE, 100)
+
+    def both(params, state, z):
+        after, info = method.update(params, state, z)
+        return jnp.sum(method.estimate(params, after).mean) + info.log_likelihood, (after, info)
+
+    def begun(params):
+        state = method.init(params, PRIOR, 0.0, KEY)
+        state, _ = method.update(params, method.predict(params, state, 1.0), measured(1.0, 11.0))
+        return method.predict(params, state, 2.0)
+
+    @jax.jit
+    def told(params, z):
+        (_, found), gradient = jax.value_and_grad(
+            lambda params: both(params, begun(params), z), has_aux=True
+        )(params)
+        return begun(params), found, gradient
+
+    for time in (2.0, 1.5):
+        late_used = time < 2 and name != "bootstrap"
+        for value in (np.nan, np.inf, -1e200):
+            state, (after, info), gradient = told(PARAMS, measured(time, value))
+            refused = Status.REJECTED if time == 2 or late_used else Status.TOO_LATE
+            assert info.status == refused
+            assert info.log_likelihood == 0
+            assert all(np.isfinite(x).all() for x in jax.tree.leaves((info, gradient)))
+            assert info.innovation_cov[0, 0] > 0
+            np.testing.assert_array_equal(after.log_weights, state.log_weights)
+            np.testing.assert_array_equal(after.particles, state.particles)
+        _, (after, info), _ = told(PARAMS, measured(time, 12.0))
+        assert info.status == (Status.LATE_USED if late_used else refused if time < 2 else 0)
+        assert np.isfinite(method.estimate(PARAMS, after).cov).all()
+
+
+@pytest.mark.parametrize("name", BUILD)
+def test_a_sensor_that_sees_nothing_at_one_time_is_rejected_there(name):
+    """NaN from `observe`, within `run`: in sequence at 2 s, late at 1.5 s."""
+
+    def observe(params, x, sensor, t):
+        return jnp.where(t == params["blind"], jnp.nan, x[:1])
+
+    method = BUILD[name](LINE._replace(observe=observe, linear=None), 100)
+
+    @jax.jit
+    def ran(blind):
+        return ej.run(method, {**PARAMS, "blind": blind}, DATA, prior=PRIOR, t0=0.0, key=KEY)
+
+    for blind, where in ((2.0, 1), (1.5, 2)):
+        trace = ran(blind)
+        late = Status.TOO_LATE if name == "bootstrap" else Status.LATE_USED
+        expected = np.array([Status.USED, Status.USED, late, Status.USED])
+        if where == 1 or name != "bootstrap":
+            expected[where] = Status.REJECTED
+        np.testing.assert_array_equal(trace.info.status, expected)
+        assert all(np.isfinite(x).all() for x in (trace.mean, trace.cov, *trace.info))
+        if where == 2:
+            np.testing.assert_array_equal(trace.mean[2], trace.mean[1])
 
 
 def test_a_sensor_without_noise_is_rejected():
@@ -91,6 +146,31 @@ def test_bearings_wrap():
     _, info = method.update(None, method.init(None, prior, 0.0, KEY), measured(0.0, -np.pi + 0.01))
     assert abs(float(info.innovation[0]) - 0.01) < 0.003
     np.testing.assert_allclose(info.innovation_cov[0, 0], 2e-4, rtol=0.2)
+
+
+@pytest.mark.parametrize("name", BUILD)
+def test_a_target_that_passes_through_a_bearing_sensor(name):
+    """Exactly over it at 2 s, where the bearing is undefined: it counts as 0 for a particle on the
+    sensor, and for the others is what they see, so that every measurement is used or rejected with
+    a status, numbers stay finite, and the filter has the target afterwards."""
+    model = constant_velocity(sensors=bearing_sensor(0.05**2), q=1e-3, dims=2)
+    prior = ej.Gaussian(np.array([-2.0, 0.0, 1.0, 0.0]), np.diag([0.04, 0.04, 0.01, 0.01]))
+    at = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 2.25, 3.0, 3.5, 4.0])
+    seen = np.arctan2(0.0, at - 2.0)
+    trace = ej.run(
+        BUILD[name](model, 2000), None, ej.stream(at, seen), prior=prior, t0=0.0, key=KEY
+    )
+    assert all(np.isfinite(x).all() for x in (trace.mean, trace.cov, *trace.info))
+    assert np.isin(trace.info.status, [Status.USED, Status.LATE_USED, *REFUSED]).all()
+    assert trace.info.status[-1] == Status.USED
+    error = trace.mean[-1] - np.array([2.0, 0.0, 1.0, 0.0])
+    assert np.abs(error / np.sqrt(np.diagonal(trace.cov[-1]))).max() < 4
+    standing = ej.Gaussian(np.zeros(4), np.zeros((4, 4)))
+    method = BUILD[name](model._replace(process_cov=lambda p, t0, t1: jnp.zeros((4, 4))), 10)
+    on_it, info = ej.step(method, None, method.init(None, standing, 0.0, KEY), measured(0.0, 0.01))
+    assert info.status == Status.USED
+    np.testing.assert_allclose(info.innovation, 0.01)
+    np.testing.assert_array_equal(method.estimate(None, on_it).mean, 0)
 
 
 @pytest.mark.parametrize("name", ["retrodict", "extended", "eks", "ps"])

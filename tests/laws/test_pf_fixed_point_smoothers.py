@@ -111,3 +111,29 @@ def test_what_is_stored_does_not_grow_with_lag_times_particles():
         assert numbers(2000, 5, smoother) - small == 1000 * 4
         entry = 1 + 3 + 6 + 1 + 2 + 1 + 2
         assert numbers(1000, 25, smoother) - small == 20 * entry
+
+
+def compiled_memory(world, particles, lag, smoother):
+    """Bytes of the compiled update: its arguments, and what it needs besides."""
+    method = pf_fixed_point(world.model, particles, lag, smoother)
+    state = jax.eval_shape(lambda k: method.init(None, world.prior, 0.0, k), jax.random.key(0))
+    one = jax.tree.map(lambda x: x[0], stream(world, np.random.default_rng(0), TIMES))
+    update = jax.jit(lambda state, z: method.update(None, state, z))
+    found = update.lower(state, one).compile().memory_analysis()
+    return found.argument_size_in_bytes, found.temp_size_in_bytes
+
+
+def test_the_particle_smoother_never_holds_the_table_of_all_pairs():
+    """N M densities of 8 bytes would be 76 MiB."""
+    particles = 10_000
+    _, temporary = compiled_memory(problem(3, 2), particles, 5, "ps")
+    table = particles * (particles // 10) * 8
+    assert temporary < table / 10
+
+
+@pytest.mark.parametrize("smoother", ["eks", "uks"])
+def test_memory_does_not_grow_with_lag_times_particles(smoother):
+    """Twenty more slots cost less than one more number for each particle."""
+    particles = 10_000
+    short, long = (sum(compiled_memory(problem(3, 2), particles, lag, smoother)) for lag in (5, 25))
+    assert long - short < 8 * particles

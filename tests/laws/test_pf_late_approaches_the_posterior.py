@@ -1,5 +1,7 @@
 """What the particle filters for late data converge to on a linear Gaussian model."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,15 +17,17 @@ from ewif_jax.oosm.pf_retrodict import pf_retrodict
 
 GIVEN = problem(3, 2)
 LAG = 4
+MANY, FEW = 3200, 200
 VARIANTS = {
-    "ext": pf_extended(GIVEN.model, 3000, LAG),
-    "eks": pf_fixed_point(GIVEN.model, 3000, LAG, "eks"),
-    "uks": pf_fixed_point(GIVEN.model, 3000, LAG, "uks"),
-    "ps": pf_fixed_point(GIVEN.model, 3000, LAG, "ps", smoother_particles=3000),
+    "ext": lambda count: pf_extended(GIVEN.model, count, LAG),
+    "eks": lambda count: pf_fixed_point(GIVEN.model, count, LAG, "eks"),
+    "uks": lambda count: pf_fixed_point(GIVEN.model, count, LAG, "uks"),
+    "ps": lambda count: pf_fixed_point(GIVEN.model, count, LAG, "ps", smoother_particles=count),
 }
 TWO_LATE = (0.5, 1.0, 1.5, 1.2, 2.0, 2.5, 3.0, 2.2)
 """The second late measurement lies after a summary that has taken the first."""
 LAST_INTERVAL = (0.5, 1.0, 1.5, 1.4)
+OLDER = (0.5, 1.0, 1.5, 0.7)
 
 
 def last(trace):
@@ -46,12 +50,33 @@ def predictive(data):
     return values[-1] - H @ mean, H @ cov @ H.T + R
 
 
+@cache
+def sampled(name, count, keys, times):
+    """Mean, covariance and info after the last arrival, in many runs of a variant."""
+    data = stream(GIVEN, np.random.default_rng(0), times)
+    build = VARIANTS.get(name, lambda count: pf_retrodict(GIVEN.model, count))
+    return runs(build(count), data, GIVEN.prior, keys, of=last)
+
+
+def retrodicted():
+    """ERRATA of (87)-(92): H* = H F^-1, R* = R + H* Q H*' instead of the exact update."""
+    data = stream(GIVEN, np.random.default_rng(0), OLDER)
+    means, covs = exact(GIVEN, data)
+    x, P = means[-2], covs[-2]
+    F, Q, b = (GIVEN.oracle[name](0.7, 1.5) for name in ("F", "Q", "b"))
+    sensor = int(data.sensor[-1])
+    H = GIVEN.H[sensor] @ np.linalg.inv(F)
+    R = GIVEN.R[sensor] + H @ Q @ H.T
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + gain @ (np.asarray(data.value[-1]) - H @ (x - b)), P - gain @ H @ P
+
+
 @pytest.mark.parametrize("times", [TWO_LATE, LAST_INTERVAL], ids=["two", "last interval"])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_limit_is_the_exact_posterior(name, times):
     data = stream(GIVEN, np.random.default_rng(0), times)
     mean, cov = (x[-1] for x in exact(GIVEN, data))
-    means, covs, info = runs(VARIANTS[name], data, GIVEN.prior, 40, of=last)
+    means, covs, info = sampled(name, MANY, 40, times)
     late = np.asarray(times) < np.maximum.accumulate(times)
     assert (info.status == np.where(late, ej.Status.LATE_USED, ej.Status.USED)).all()
     assert deviation(means, mean) < 4
@@ -65,20 +90,33 @@ def test_the_limit_is_the_exact_posterior(name, times):
 
 
 def test_retrodiction_converges_to_another_kalman_update():
-    """ERRATA of (87)-(92): H* = H F^-1, R* = R + H* Q H*' instead of the exact update."""
-    data = stream(GIVEN, np.random.default_rng(0), (0.5, 1.0, 1.5, 0.7))
-    means, covs = exact(GIVEN, data)
-    x, P = means[-2], covs[-2]
-    F, Q, b = (GIVEN.oracle[name](0.7, 1.5) for name in ("F", "Q", "b"))
-    sensor = int(data.sensor[-1])
-    H = GIVEN.H[sensor] @ np.linalg.inv(F)
-    R = GIVEN.R[sensor] + H @ Q @ H.T
-    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    limit = x + gain @ (np.asarray(data.value[-1]) - H @ (x - b)), P - gain @ H @ P
-    found = runs(pf_retrodict(GIVEN.model, 4000), data, GIVEN.prior, 60, of=last)
-    for samples, claim, truth in zip(found, limit, (means[-1], covs[-1]), strict=False):
+    data = stream(GIVEN, np.random.default_rng(0), OLDER)
+    truth = (x[-1] for x in exact(GIVEN, data))
+    found = sampled("retrodict", MANY, 60, OLDER)
+    for samples, claim, other in zip(found, retrodicted(), truth, strict=False):
         assert deviation(samples, claim) < 4
-        assert deviation(samples, truth) > 8
+        assert deviation(samples, other) > 8
+
+
+@pytest.mark.parametrize("name", [*VARIANTS, "retrodict"])
+def test_the_error_falls_as_the_root_of_the_number_of_particles(name):
+    """Sixteen times as many: a quarter of the RMS error of the mean, in units of its posterior."""
+    times, keys = (OLDER, 60) if name == "retrodict" else (LAST_INTERVAL, 40)
+    limit = retrodicted()
+    if name != "retrodict":
+        limit = [x[-1] for x in exact(GIVEN, stream(GIVEN, np.random.default_rng(0), times))]
+    root = np.linalg.cholesky(limit[1])
+
+    def squares(count, keys):
+        off = sampled(name, count, keys, times)[0] - limit[0]
+        return np.sum(np.linalg.solve(root, off.T) ** 2, 0)
+
+    few, many = squares(FEW, 200), squares(MANY, keys)
+    ratio = np.sqrt(few.mean() / many.mean())
+    parts = [x.std(ddof=1) / x.mean() / np.sqrt(x.size) for x in (few, many)]
+    error = ratio * np.hypot(*parts) / 2
+    assert error < 0.6
+    assert abs(ratio - 4) < 4 * error
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from ewif_jax.analysis.anderson_continuous import (
     weighting_as_input_noise,
 )
 from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
-from ewif_jax.continuous.error import actual_error_continuous
+from ewif_jax.continuous.error import actual_error_continuous, error_bounds_continuous
 from ewif_jax.scenarios.divergence import (
     PUSHES,
     divergence,
@@ -241,6 +241,134 @@ def test_actual_error_settles_between_the_bounds():
     assert smallest(curve.design - curve.error) > -1e-8 * scale
     steady = steady_state_continuous(system, fading_rate=0.3)
     np.testing.assert_allclose(curve.error[-1], steady.error, rtol=1e-7, atol=1e-8 * scale)
+
+
+def varying(system, seed):
+    """The system with every matrix varying, as functions of t for NumPy, and for us of (p, t)."""
+    rng = np.random.default_rng(seed)
+    swings = [0.3 * rng.uniform(size=np.shape(x)) for x in system]
+    swings[3], swings[4] = 0.2 * np.eye(len(swings[3])), 0.2 * np.eye(len(swings[4]))
+    numbers = [
+        lambda t, x=x, s=s, k=k: x + s * np.sin((1 + k) * t)
+        for k, (x, s) in enumerate(zip(system, swings, strict=True))
+    ]
+    ours = [
+        lambda p, t, x=x, s=s, k=k: x + jnp.asarray(s) * jnp.sin((1 + k) * t)
+        for k, (x, s) in enumerate(zip(system, swings, strict=True))
+    ]
+    return numbers, ContinuousSystem(*ours)
+
+
+def dense_error(design, truth, rate, cov0, mean0, times):
+    """E and Pi by SciPy: the second moments of state and *estimate*, integrated as they stand."""
+    n = len(mean0)
+
+    def slope(t, y):
+        S, P = y[: 4 * n * n].reshape(2 * n, 2 * n), y[4 * n * n :].reshape(n, n)
+        Fd, Gd, Hd, Qd, Rd = (x(t) for x in design)
+        F, G, H, Q, R = (x(t) for x in truth)
+        K = P @ Hd.T @ np.linalg.inv(Rd)
+        move = np.block([[F, np.zeros((n, n))], [K @ H, Fd - K @ Hd]])
+        noise = np.block([[G @ Q @ G.T, np.zeros((n, n))], [np.zeros((n, n)), K @ R @ K.T]])
+        P_slope = Fd @ P + P @ Fd.T + 2 * rate(t) * P - K @ Rd @ K.T + Gd @ Qd @ Gd.T
+        return np.concatenate([(move @ S + S @ move.T + noise).ravel(), P_slope.ravel()])
+
+    away = np.outer(mean0, mean0)
+    start = np.block([[cov0 + away, away], [away, away]])
+    y = solve_ivp(
+        slope, (times[0], times[-1]), np.concatenate([start.ravel(), cov0.ravel()]), "DOP853",
+        times, rtol=1e-11, atol=1e-12,
+    ).y.T  # fmt: skip
+    S = y[:, : 4 * n * n].reshape(-1, 2 * n, 2 * n)
+    error = S[:, :n, :n] - S[:, :n, n:] - S[:, n:, :n] + S[:, n:, n:]
+    return error, y[:, 4 * n * n :].reshape(-1, n, n)
+
+
+def calm(seed):
+    """`continuous`, with a motion that does not run away."""
+    system = continuous(seed)
+    return system._replace(F=system.F - 1.5 * np.eye(3))
+
+
+CURVE_TIMES = np.array([0.0, 0.3, 1.0, 2.5])
+COV0, MEAN0 = np.diag([1.0, 0.5, 2.0]), np.array([1.0, -2.0, 0.5])
+
+
+def test_actual_error_in_another_system_is_the_dense_integration():
+    """F, G, H, Q, R and alpha differ from the design's, and all vary with time."""
+    design, our_design = varying(calm(3), 1)
+    truth, our_truth = varying(calm(4), 2)
+    error, cov = dense_error(design, truth, lambda t: 0.2 + 0.1 * t, COV0, MEAN0, CURVE_TIMES)
+    curve = actual_error_continuous(
+        our_design, None, COV0, times=CURVE_TIMES, fading_rate=lambda p, t: 0.2 + 0.1 * t,
+        truth=our_truth, mean0=MEAN0,
+    )  # fmt: skip
+    np.testing.assert_allclose(curve.error, error, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(curve.design, cov, rtol=1e-7, atol=1e-8)
+    assert np.abs(curve.error[-1] - curve.design[-1]).max() > 0.1
+
+
+def test_actual_error_in_another_system_is_that_of_fine_sampling():
+    """The sampled weighted filter of the same two systems, twice as close with half the step."""
+    design, truth = calm(3), calm(4)
+    rate, length = 0.25, 1.0
+    exact = actual_error_continuous(
+        design, None, COV0, times=np.array([0.0, length]), fading_rate=rate, truth=truth,
+        mean0=MEAN0,
+    ).error[-1]  # fmt: skip
+
+    def sampled(steps):
+        dt = length / steps
+
+        def at(system):
+            F, G, H, Q, R = system
+            return System(np.eye(3) + dt * F, H, dt * G @ Q @ G.T, R / dt)
+
+        fading = np.exp(rate * dt)
+        gain = weighted_covariances(at(design), COV0, fading=fading, steps=steps).gain
+        return actual_error(gain, at(truth), COV0, design=at(design), mean0=MEAN0)[-1]
+
+    coarse, fine = sampled(1000), sampled(2000)
+    scale = np.abs(exact).max()
+    np.testing.assert_allclose(2 * fine - coarse, exact, atol=2e-4 * scale)
+    assert np.abs(fine - exact).max() < 0.6 * np.abs(coarse - exact).max() < 0.02 * scale
+
+
+def test_a_truth_with_other_noises_only_solves_4_9():
+    """Then the state cancels, whatever its mean, and a truth equal to the design is no truth."""
+    design = calm(3)
+    plain = actual_error_continuous(design, None, COV0, times=CURVE_TIMES, fading_rate=0.3)
+    same = actual_error_continuous(
+        design, None, COV0, times=CURVE_TIMES, fading_rate=0.3, truth=design, mean0=MEAN0
+    )
+    np.testing.assert_allclose(same.error, plain.error, rtol=1e-8, atol=1e-9)
+    loud = design._replace(Q=4 * design.Q, R=3 * design.R)
+    K = steady_state_continuous(design, fading_rate=0.3).gain
+    settled = actual_error_continuous(
+        design, None, COV0, times=np.array([0.0, 40.0]), fading_rate=0.3, truth=loud, mean0=MEAN0
+    ).error[-1]
+    closed = design.F - K @ design.H
+    driven = loud.G @ loud.Q @ loud.G.T + K @ loud.R @ K.T
+    np.testing.assert_allclose(closed @ settled + settled @ closed.T, -driven, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_continuous_error_lies_between_the_best_and_the_believed(seed):
+    """(4-11) at every time, in the order of positive semidefinite matrices; and as it settles."""
+    system = continuous(seed)
+    times = np.array([0.0, 0.2, 1.0, 3.0, 60.0])
+    bounds = error_bounds_continuous(system, None, COV0, times=times, fading_rate=0.3)
+    for k in range(times.size):
+        scale = np.abs(bounds.design[k]).max()
+        assert smallest(bounds.error[k] - bounds.best[k]) > -1e-7 * scale
+        assert smallest(bounds.design[k] - bounds.error[k]) > -1e-7 * scale
+    assert smallest(bounds.design[1] - bounds.best[1]) > 0
+    steady = steady_state_continuous(system, fading_rate=0.3)
+    scale = np.abs(steady.cov).max()
+    np.testing.assert_allclose(bounds.error[-1] / scale, steady.error / scale, atol=1e-6)
+    np.testing.assert_allclose(
+        bounds.best[-1] / scale, steady_state_continuous(system).cov / scale, atol=1e-6
+    )
 
 
 def test_divergence_as_printed_and_as_corrected():

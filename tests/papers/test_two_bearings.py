@@ -10,8 +10,6 @@ from ewif_jax.study.claims import ratio, share
 from ewif_jax.study.late import mean_of, rmse
 from ewif_jax.study.two_bearings import FIVE, NONE, TEN
 
-USED = (runs_of.EKF, runs_of.RTS, runs_of.ENKF1, runs_of.ENKF2, runs_of.SHARED, runs_of.EXACT,
-        runs_of.DROP, runs_of.HALF)  # fmt: skip
 REFERENCE = {
     runs_of.EXACT: ((3.57, 0.21), (6.67, 0.26), (10.85, 0.33)),
     runs_of.RTS: ((3.56, 0.20), (6.86, 0.25), (12.04, 0.32)),
@@ -21,8 +19,9 @@ REFERENCE = {
 }
 """independently computed: RMSE and standard error at the three delays"""
 BOUND = (3.38, 6.37, 10.52)
-LOST = (0.22, 0.51, 0.79)
-"""independently computed, over 100 runs: shares of lost runs with 5,000 retrodicted particles"""
+LOST = {runs_of.PF: (0.07, 0.23, 0.60), runs_of.HALF: (0.22, 0.51, 0.79)}
+"""independently computed, over 100 runs: shares of lost runs with 10,000 and 5,000 retrodicted
+particles"""
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +31,8 @@ def world():
 
 @pytest.fixture(scope="module")
 def found(world):
-    """The particle filter is the one of half the particles, 5,000."""
     every = runs_of.methods(10_000)
-    return {name: runs_of.followed(every[name], world, jax.random.key(5)) for name in USED}
+    return {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +83,18 @@ def test_without_a_delay_the_filters_are_alike(off):
     ("better", "worse"),
     [
         (runs_of.ENKF2, runs_of.ENKF1),
+        (runs_of.EKF, runs_of.ENKF1),
         (runs_of.RTS, runs_of.EKF),
         (runs_of.SHARED, runs_of.ENKF2),
+        (runs_of.SHARED, runs_of.EKF),
         (runs_of.EXACT, runs_of.RTS),
     ],
 )
-def test_order_of_the_filters(off, better, worse, delay):
-    found = ratio(off[better][delay], off[worse][delay])
-    assert found.value + 2 * found.error < 1
+def test_order_of_the_filters(found, off, better, worse, delay):
+    """In the runs that neither loses."""
+    kept = ~np.any([study.lost(found[name]["error"])[delay] for name in (better, worse)], 0)
+    gain = ratio(off[better][delay][kept], off[worse][delay][kept])
+    assert gain.value + 2 * gain.error < 1
 
 
 def test_enkf1_is_twice_as_far_off_as_enkf2(off):
@@ -111,20 +113,30 @@ def test_dropping_what_is_late_loses_the_target(found):
         assert study.lost(found[name]["error"])[: FIVE + 1].mean() < 0.02
 
 
-def test_retrodicted_particles_get_lost_the_more_the_longer_the_delay(found):
-    gone = study.lost(found[runs_of.HALF]["error"])
-    for delay, expected in enumerate(LOST):
+@pytest.mark.parametrize("name", LOST)
+def test_retrodicted_particles_get_lost_the_more_the_longer_the_delay(found, name):
+    gone = study.lost(found[name]["error"])
+    for delay, expected in enumerate(LOST[name]):
         ours, theirs = share(gone[delay]), np.sqrt(expected * (1 - expected) / 100)
         assert abs(ours.value - expected) < 4 * np.hypot(ours.error, theirs)
     more = mean_of(gone[TEN].astype(float) - gone[NONE])
     assert more.value > 3 * more.error
 
 
-def test_a_row_for_every_claim(world, found, bound):
-    given = {**found, runs_of.PF: found[runs_of.HALF],
-             runs_of.ONE: found[runs_of.DROP], runs_of.OTHER: found[runs_of.DROP]}  # fmt: skip
-    rows = study.claims(given, bound, world.times)
-    holds = {row["claim"]: row["holds"] for row in rows}
-    assert holds["RTS-based over EKF at 10 s (RMSE ratio)"] == "yes"
-    assert holds["the printed bound over the SD of the EKF (5 s)"] == "yes"
-    assert holds["EnKF1 is worse than EnKF2 at 5 s (RMSE ratio)"] == "yes"
+def test_one_sensor_alone_loses_the_target(found):
+    """The bearings of one sensor do not tell how far the target is."""
+    for name in (runs_of.ONE, runs_of.OTHER):
+        gone = study.lost(found[name]["error"])
+        assert (gone.mean(1) > 0.7).all()
+
+
+def test_the_claims(world, found, bound):
+    """Each is decided by so few runs, but for one that hangs on 2 or 3 %."""
+    rows = {row["claim"]: row for row in study.claims(found, bound, world.times)}
+    holds = {name: row["holds"] for name, row in rows.items()}
+    assert len(rows) == 17
+    assert holds.pop("EKF (Al1) over EnKF2 at 10 s (RMSE ratio)") != "no"
+    assert set(holds.values()) == {"yes"}
+    gone = {name: study.lost(one["error"])[TEN] for name, one in found.items()}
+    both = ~(gone[runs_of.RTS] | gone[runs_of.EKF])
+    assert rows["RTS-based over EKF (Al1) at 10 s (RMSE ratio)"]["runs"] == both.sum()

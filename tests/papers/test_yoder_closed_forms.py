@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import late
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import expm, logm, solve_discrete_are
 
 from ewif_jax.analysis.merit import (
     alpha_beta_eigenvalues,
@@ -113,17 +113,105 @@ def test_real_delays_compose():
     np.testing.assert_allclose(walk[0, 0], (1 - k) ** 2.5 * k)
 
 
-def test_the_envelope_holds_the_oscillating_gain():
-    """The delayed gain changes sign, yet over its envelope it neither grows nor fades."""
-    system = dwna(1.0)
-    rate = 0.1 ** (1 / float(cutoff_delay(*system, ratio=0.1)))
-    np.testing.assert_allclose(rate, np.abs(alpha_beta_eigenvalues(1.0)).max())
-    K = steady_state_gain(*system)
-    loop = (np.eye(2) - np.asarray(K) @ H) @ F
-    gains = np.array([np.linalg.matrix_power(loop, k) @ K for k in range(40)])[..., 0]
-    assert (gains[:, 0] < 0).any()
-    above = np.linalg.norm(gains, axis=1) / rate ** np.arange(40)
-    np.testing.assert_allclose(above[:20].max(), above[20:].max(), rtol=0.05)
+def norm_ratios(system, steps):
+    """The norm of the delayed gain at real numbers of steps, over that of a fresh one's: by SciPy's
+    Riccati solver and logarithm."""
+    F, H, Q, R = system
+    P = solve_discrete_are(F.T, H.T, Q, R)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    rates = logm((np.eye(len(F)) - K @ H) @ F)
+    fine = expm(rates * (steps[1] - steps[0]))
+    kept, norms = K.astype(complex), []
+    for _ in steps:
+        norms.append(np.linalg.norm(kept.real))
+        kept = fine @ kept
+    return np.array(norms) / norms[0]
+
+
+@pytest.mark.parametrize(
+    ("index", "seconds"),
+    [(0.1, 0.8445), (1.0, 0.1566), (7.0, 0.5714), (8.0, 0.6422), (50.0, 3.5718)],
+)
+def test_the_cutoff_is_the_last_crossing_of_an_oscillating_gain(index, seconds):
+    """Also where the two eigenvalues coincide, at lambda = 8."""
+    found = cutoff_delay(*dwna(index), ratio=0.6, interval=DT)
+    np.testing.assert_allclose(found, seconds, atol=6e-5)
+    if index != 8.0:
+        steps = np.linspace(0, 20, 20_001)
+        last = steps[np.flatnonzero(norm_ratios(dwna(index), steps) >= 0.6)[-1]]
+        assert 0 <= found / DT - last < 1.001e-3
+
+
+def test_the_last_crossing_is_found_among_many():
+    """Slow rotations, damped by little: hundreds of crossings, and the last one counts."""
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        turn, squeeze = rng.uniform(0.3, 1.0), np.diag([1.0, rng.uniform(1.5, 3.0)])
+        c, s = np.cos(turn), np.sin(turn)
+        F = squeeze @ np.array([[c, -s], [s, c]]) @ np.linalg.inv(squeeze)
+        system = F, np.array([[1.0, 0.4]]), 1e-4 * np.eye(2), np.eye(1)
+        steps = np.linspace(0, 400, 80_001)
+        above = norm_ratios(system, steps) >= 0.4
+        assert np.abs(np.diff(above.astype(int))).sum() > 5
+        found = cutoff_delay(*system, ratio=0.4)
+        assert 0 <= found - steps[np.flatnonzero(above)[-1]] < 5.001e-3
+
+
+GROWING = {
+    "one state": (np.array([[1.1]]), np.array([[1.0]]), np.zeros((1, 1)), np.eye(1)),
+    "beside a driven one": (
+        np.diag([1.1, 0.9]), np.array([[1.0, 1.0]]), np.diag([0.0, 1.0]), np.eye(1),
+    ),
+    "three states": (
+        np.array([[1.2, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.05]]),
+        np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]), np.zeros((3, 3)), np.diag([0.5, 2.0]),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GROWING)
+def test_a_growing_mode_without_noise_is_followed(name):
+    """The equation has several solutions; the filter converges to the one that is stable."""
+    F, H, Q, R = GROWING[name]
+    P = solve_discrete_are(F.T, H.T, Q, R)
+    expected = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    found = steady_state_gain(F, H, Q, R)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found, late.steady_gain(F, H, Q, R), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        delayed_gain(F, H, Q, R, 3), late.delayed_gain(F, H, Q, R, 3), rtol=1e-8, atol=1e-12
+    )
+    steps = np.linspace(0, 60, 60_001)
+    last = steps[np.flatnonzero(norm_ratios((F, H, Q, R), steps) >= 0.6)[-1]]
+    assert 0 <= cutoff_delay(F, H, Q, R) - last < 1.001e-3
+    slope, h = jax.grad(lambda r: cutoff_delay(F, H, Q, r * R))(1.3), 1e-4
+    ends = [cutoff_delay(F, H, Q, (1.3 + s) * R) for s in (h, -h)]
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-8)
+
+
+def test_where_no_cutoff_exists_it_says_so():
+    still = 1.0, 1.0, 0.0, 1.0
+    np.testing.assert_array_equal(steady_state_gain(*still), [[0.0]])
+    assert np.isnan(cutoff_delay(*still))
+    assert np.isnan(cutoff_delay(np.eye(2), H, np.eye(2), 1.0))
+    resting = np.diag([1.1, 1.0]), np.ones((1, 2)), np.zeros((2, 2)), 1.0
+    np.testing.assert_allclose(steady_state_gain(*resting), [[0.21 / 1.21], [0.0]], atol=1e-12)
+    assert np.isposinf(cutoff_delay(*resting))
+    assert cutoff_delay(0.0, 1.0, 1.0, 1.0) == 0
+
+
+def test_equal_axes_have_derivatives():
+    """Two axes of one motion: every eigenvalue of the loop is there twice."""
+    F2, H2, Q2 = (np.kron(np.eye(2), x) for x in (F, H, G @ G.T))
+
+    def loss(q):
+        system = F2, H2, q * Q2, np.eye(2)
+        return cutoff_delay(*system) + jnp.sum(delayed_gain(*system, 1.5))
+
+    expected = (loss(3 + 1e-5) - loss(3 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(3.0), expected, rtol=1e-7)
+    alone = cutoff_delay(F, H, 3 * G @ G.T, 1.0)
+    np.testing.assert_allclose(cutoff_delay(F2, H2, 3 * Q2, np.eye(2)), alone, rtol=1e-9)
 
 
 def test_algorithm_1_at_equal_intervals_is_the_closed_form():

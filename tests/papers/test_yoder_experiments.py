@@ -11,11 +11,14 @@ from ewif_jax.study import random_walk as walks
 from ewif_jax.study.late import exact_late, history_needed, paired, rmse, rmses, sweep
 
 WALKS = {
-    "4a": (5.60, 0.19, 4.14, 0.13, 4.01, 0.12, 3.97, 0.12),
+    "4a": (6.04, 0.04, 4.14, 0.13, 4.01, 0.12, 3.97, 0.12),
     "4b": (14.40, 0.16, 12.32, 0.11, 12.01, 0.09, 11.94, 0.09),
     "4c": (33.64, 0.11, 32.27, 0.10, 31.71, 0.09, 31.57, 0.09),
 }
-"""independently computed: RMSE and standard error of drop, selective at T_d, Al1, exact"""
+"""independently computed: RMSE and standard error of drop, selective at T_d, Al1, exact (4a, drop:
+of 2,000 runs; the rest of 40)"""
+FASTEST = walks.Case("5d", 500.0, 0.1)
+CASES = (*walks.CASES, FASTEST)
 RECOVERED = {"4a": 0.92, "4b": 0.87, "4c": 0.71}
 HEAD = {0: 55.28, 2: 53.40, 3: 52.41, 4: 51.82, heads.stale(): 51.34, 8: 51.33, 10: 51.40,
         15: 51.72, 20: 51.90, np.inf: 52.00}  # fmt: skip
@@ -25,7 +28,7 @@ HEAD = {0: 55.28, 2: 53.40, 3: 52.41, 4: 51.82, heads.stale(): 51.34, 8: 51.33, 
 @pytest.fixture(scope="module")
 def walk():
     """Mean squared errors (V, 3, R) at the multiples of T_d, and of the exact estimate (3, R)."""
-    runs, cases = 16, walks.CASES
+    runs, cases = 16, CASES
     batches = [
         ej.simulate_batch(
             random_walk(case.sigma**2, walks.VARIANCE, walks.INTERVAL, case.delay),
@@ -71,7 +74,7 @@ def head():
 @pytest.mark.parametrize(("number", "name"), list(enumerate(WALKS)))
 def test_random_walk_errors_are_those_of_an_independent_computation(walk, number, name):
     squared, exact = walk
-    rows = squared[0], squared[walks.AT_CUTOFF], squared[-1], exact[:, None].swapaxes(0, 1)[0]
+    rows = squared[0], squared[walks.AT_CUTOFF], squared[-1], exact
     reference = np.reshape(WALKS[name], (4, 2))
     for row, (value, error) in zip(rows, reference, strict=True):
         found = rmse(row[number])
@@ -86,17 +89,39 @@ def test_exact_is_not_worse_than_al1_nor_al1_than_dropping_on_the_right_model(wa
         assert rmse(exact[number]).value < rmse(squared[-1, number]).value * 1.01
 
 
+def test_what_dropping_costs_on_the_slowest_walk():
+    """Case 4a varies a lot between runs, so it takes many: the expectation is 6.04 +- 0.04."""
+    case, runs = walks.CASES[0], 300
+    scenario = random_walk(case.sigma**2, walks.VARIANCE, walks.INTERVAL, case.delay)
+    batch = ej.simulate_batch(scenario, jax.random.split(jax.random.key(10), runs))
+    filtered = ej.drop_late(ej.kalman(random_walk_model(case.sigma**2, walks.VARIANCE)))
+    squared = sweep(filtered, {"none": np.zeros(1)}, batch, prior=scenario.prior, t0=0.0)
+    found = rmse(squared["squared_error"][0])
+    assert found.error < 0.13
+    assert abs(found.value - 6.04) < 3.5 * np.hypot(found.error, 0.04)
+
+
 def test_the_cutoff_recovers_most_of_the_gain_over_three_decades(walk):
-    """At T_d of (8) 92, 87 and 71 % of the way from drop to Al1; all of it at 3 T_d."""
+    """At T_d of (8) 92, 87 and 71 % of the way from drop to Al1; all of it at 3 T_d. With the
+    fastest motion there is 1 % of the RMSE to recover; 95 % of that is back at about 2.4 T_d."""
     squared, _ = walk
-    cutoffs = [walks.theoretical(case.sigma) for case in walks.CASES]
-    np.testing.assert_allclose(cutoffs, [22.845, 2.2847, 0.2303], rtol=1e-3)
+    cutoffs = [walks.theoretical(case.sigma) for case in CASES]
+    np.testing.assert_allclose(cutoffs, [22.845, 2.2847, 0.2303, 0.0331], rtol=2e-3)
     for number, share in enumerate(RECOVERED.values()):
         found = walks.recovered(squared[:, number])
         assert abs(found[walks.AT_CUTOFF] - share) < 0.1
         at_three = np.flatnonzero(walks.MULTIPLES == 3)[0]
         assert found[at_three] > 0.93
         assert 0.8 < walks.reach(found, 0.95) < 3
+    fastest = squared[:, CASES.index(FASTEST)]
+    better = paired(fastest[-1], fastest[0])
+    assert better.value < -4 * better.error
+    print(
+        walks.recovered(fastest),
+        walks.reach(walks.recovered(fastest), 0.95),
+        rmse(fastest[0]),
+        better,
+    )
 
 
 @pytest.mark.parametrize("cutoff", list(HEAD))

@@ -1,10 +1,12 @@
 """The study of the turn runs from end to end."""
 
+import jax
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 import ewif_jax as ej
+from ewif_jax.scenarios import turn as turn_scenario
 from ewif_jax.scenarios import turn_model
 from ewif_jax.study import turn
 from ewif_jax.study import turn_runs as runs_of
@@ -47,4 +49,16 @@ def test_study_runs_end_to_end(tmp_path, monkeypatch):
         assert 15 < float(stored["late_used"].sel(filter="PFoosmPS")) < 25
     table = pd.read_csv(folder / "turn.csv").set_index("filter")
     assert table.loc["PFord", "position RMS [m]"] < table.loc["PFstd", "position RMS [m]"]
-    assert set(pd.read_csv(folder / "claims.csv")["holds"]) <= {"yes", "no", "not beyond noise"}
+    claims = pd.read_csv(folder / "claims.csv")
+    assert set(claims["holds"]) <= {"yes", "no", "not beyond noise"}
+    assert (claims["reason"].isna() == (claims["holds"] == "yes")).all()
+    assert (table["s/run_se"] > 0).all()
+
+
+def test_the_sigma_points_are_the_printed_ones_where_they_can_be():
+    assert "alpha = 1e-3, beta" in runs_of.sigma_points_note()
+    with jax.enable_x64(False):
+        assert "cubature" in runs_of.sigma_points_note()
+        prior = turn_scenario().prior
+        state = runs_of.methods(10)[runs_of.UKF].estimator.init(None, prior, 0.0)
+        assert state.mean.dtype == "float32"

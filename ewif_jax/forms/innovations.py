@@ -1,0 +1,61 @@
+"""Comparing a measurement with what was expected of it, and refusing what is not a number."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels.small import matmul
+from ewif_jax.models.model import Model
+from ewif_jax.types import Info, Status
+
+
+class Compared(NamedTuple):
+    """A measurement seen as one of the present state: difference (m,), measured minus predicted,
+    H (m, n), noise covariance R (m, m), and mask (m,) of what is present."""
+
+    difference: Array
+    H: Array
+    R: Array
+    mask: Array
+
+
+def numbers(difference: Array, cov: Array, mask: Array) -> Array:
+    """Whether an innovation (m,) of covariance `cov` (m, m) and its log density are finite in the
+    components that are present, () bool."""
+    cov = gaussian.mask_cov(cov, mask)
+    white = cholesky.forward(cholesky.factor(cov), jnp.where(mask, difference, 0))
+    return jnp.isfinite(jnp.sum(jnp.square(white))) & jnp.all(jnp.isfinite(cov))
+
+
+def sound(model: Model, cov: Array, seen: Compared) -> tuple[Compared, Array]:
+    """`seen` by a state of packed covariance `cov`, or nothing at all where innovation or log
+    density would not be finite, and whether it is used, () bool.
+
+    What is refused is zero before anything is computed from it, so that gradients stay finite.
+    A linear model's measurements pass unseen: a gain that looks at values could not be shared by a
+    batch of runs. Their values are checked by `run` and `step`.
+    """
+    difference, H, R, mask = seen
+    if model.linear is not None:
+        return seen, jnp.asarray(True)
+    H = jnp.where(mask[:, None], H, 0)
+    good = numbers(difference, matmul(symmetric.rows(H, cov), H.T) + R, mask)
+    difference, H, R = (jnp.where(good, x, 0) for x in (difference, H, R))
+    return Compared(difference, H, R, mask & good), good
+
+
+def updated(model: Model, mean: Array, cov: Array, seen: Compared) -> tuple[Array, Array, Info]:
+    """Mean and packed covariance after a measurement, with its `Info` (delay 0, status USED or
+    REJECTED)."""
+    (difference, H, R, mask), good = sound(model, cov, seen)
+    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
+    info = Info(
+        innovation.value,
+        innovation.cov,
+        gaussian.log_density(innovation, mask),
+        jnp.zeros((), mean.dtype),
+        jnp.where(good, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),
+    )
+    return mean, cov, info
