@@ -53,19 +53,19 @@ def pytest_configure(config):
     config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(config, items):
     """Leaves out what is slow and covered otherwise, unless `--all`. With `--dist loadgroup`, tests
     that share what they compile run in one process: those of a file, or in tests/contracts those of
-    an estimator. Studies share nothing."""
+    an estimator."""
     if not config.getoption("--all"):
         left_out = [item for item in items if _slow(item)]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if not _slow(item)]
     for item in items:
-        room = Path(item.fspath).parent.name
         row = getattr(item, "callspec", None) and item.callspec.params.get("row")
-        if room != "study" and config.pluginmanager.hasplugin("xdist"):
-            name = f"{room}-{row.name}" if row is not None else str(item.fspath)
+        if config.pluginmanager.hasplugin("xdist"):
+            name = Path(item.fspath).stem if row is None else row.name
             item.add_marker(pytest.mark.xdist_group(name))
 
 

@@ -48,11 +48,11 @@ def bootstrap(
     Gradients: particles are differentiated along their random numbers, and resampling keeps the
     derivative of the weights (w / stop_gradient(w), Scibior & Wood 2021), so that the derivative
     of the likelihood estimate (exp of the summed log likelihood) is unbiased, and that of the log
-    likelihood has a bias of order 1 / N. Its variance grows faster than the square of the number of
-    steps, because ancestral lines merge: of random walks over 6 to 48 steps that resample at every
-    one, with powers from 2 to 4, which rise with the number of steps and depend on the data and on
-    the parameter. It is not the finite difference of a run with equal random numbers, which jumps
-    where a resampling changes. With ess_threshold=0 both are equal.
+    likelihood has a bias of order 1 / N. Its variance grows with a power of the number of steps,
+    because ancestral lines merge: from 1.4 to 4 for random walks of 6 to 48 steps that resample at
+    every one, more for longer ones, and depending on the data and the parameter. It is not the
+    finite difference of a run with equal random numbers, which jumps where a resampling changes.
+    With ess_threshold=0 both are equal.
 
     Reduces to: `kalman` on a linear model as N grows, with errors of order 1 / sqrt(N).
 

@@ -60,7 +60,8 @@ def rts(
         model: any `Model` with process noise defined for t1 >= t0.
         params: what its parameters are read from; differentiable.
         measurements: T measurements; they are put in time order here. One with nothing in it is
-            just a time to report at.
+            just a time to report at: the state is predicted to it and on from it, which for a
+            model that is not linear is not quite the one prediction across it that `run` makes.
         prior: Gaussian at t0.
         t0: its time in seconds, not later than any measurement.
         form: "extended" or "unscented".
