@@ -171,7 +171,11 @@ def value_and_gradient(loss: Loss, params: Any, *rest: Any) -> tuple[Array, Any]
         value, slope = jax.jvp(of, (flat,), (jnp.ones_like(flat),))
         return value, unflatten(slope[None])
     directions = jnp.eye(flat.size + flat.size % 2, flat.size, dtype=flat.dtype)
-    values, slopes = lax.map(along, directions.reshape(-1, 2, flat.size))
+    pairs = directions.reshape(-1, 2, flat.size)
+    if flat.size == 2:  # a loop of one turn would cost as much as another slope
+        value, slopes = along(pairs[0])
+        return value, unflatten(slopes)
+    values, slopes = lax.map(along, pairs)
     return values[0], unflatten(slopes.reshape(-1)[: flat.size])
 
 
