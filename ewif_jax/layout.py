@@ -193,12 +193,13 @@ def on_devices(tree: Any, flags: Any, devices: int) -> Any:
     if devices == 1:
         return tree
 
-    split, shared = (NamedSharding(_mesh(devices), PartitionSpec(*x)) for x in (["runs"], []))
+    mesh = _mesh(devices)
 
     def put(x: Any, flag: bool) -> Any:
-        return (
-            x if isinstance(x, Tracer) else jax.device_put(_on_host(x), split if flag else shared)
-        )
+        if isinstance(x, Tracer):
+            return x
+        spec = PartitionSpec("runs") if flag else PartitionSpec()
+        return jax.device_put(_on_host(x), NamedSharding(mesh, spec))
 
     return jax.tree.map(put, tree, flags)
 

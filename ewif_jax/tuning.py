@@ -146,8 +146,8 @@ def tune(
 def value_and_gradient(loss: Loss, params: Any, *rest: Any) -> tuple[Array, Any]:
     """`loss(params, *rest)` and its gradient in `params`, a pytree of floats.
 
-    Up to four numbers go through forward mode, which keeps no history, two of them in one pass of
-    less than three times what the loss takes; more through reverse mode.
+    Up to four numbers go through forward mode, which keeps no history, two of them in one pass;
+    more through reverse mode.
     """
     flat, unflatten = ravel_pytree(params)
     if flat.size > FORWARD_UP_TO:
@@ -171,11 +171,7 @@ def value_and_gradient(loss: Loss, params: Any, *rest: Any) -> tuple[Array, Any]
         value, slope = jax.jvp(of, (flat,), (jnp.ones_like(flat),))
         return value, unflatten(slope[None])
     directions = jnp.eye(flat.size + flat.size % 2, flat.size, dtype=flat.dtype)
-    pairs = directions.reshape(-1, 2, flat.size)
-    if flat.size == 2:  # a loop of one turn would cost as much as another slope
-        value, slopes = along(pairs[0])
-        return value, unflatten(slopes)
-    values, slopes = lax.map(along, pairs)
+    values, slopes = lax.map(along, directions.reshape(-1, 2, flat.size))
     return values[0], unflatten(slopes.reshape(-1)[: flat.size])
 
 
