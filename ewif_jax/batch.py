@@ -100,7 +100,9 @@ def run_batch(
     keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
     count = device_count(runs, devices)
     inputs = on_devices((*inputs, keys, context), flags, count)
-    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count)
+    mask = checks.known(measurements.mask)
+    complete = mask is not None and bool(mask.all())
+    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, complete)
 
 
 def _one_for_each(key: Any) -> bool:
@@ -138,7 +140,7 @@ def check_runs(
     validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
 
 
-@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices"))
+@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices", "complete"))
 def _run_batch(
     estimator: Estimator,
     inputs: Any,
@@ -147,7 +149,9 @@ def _run_batch(
     clock: Clock,
     observe: Observer | None,
     devices: int,
+    complete: bool,
 ) -> Any:
+    """`complete`: nothing is masked, which the compiled program then need not look for."""
     params, measurements, prior, times, keys, context = inputs
     dtype = float_dtype(measurements.value)
     measurements = measurements._replace(
@@ -166,7 +170,8 @@ def _run_batch(
                 if size == 1
                 else (runs_last(inputs, flags.tree), flags.tree)
             )
-            return _scanned(estimator, inputs, found, size, t0, clock, observe or _everything)
+            how = clock, observe or _everything, complete
+            return _scanned(estimator, inputs, found, size, t0, *how)
 
         return in_groups(together, inputs, flags.tree, runs, size)
 
@@ -201,6 +206,7 @@ def _scanned(
     t0: Any,
     clock: Clock,
     observe: Observer,
+    complete: bool,
 ) -> tuple[Any, Any]:
     """Observations (R, T, ...) and final states (R, ...) from inputs with the runs last."""
     params, measurements, prior, times, keys, context = inputs
@@ -212,6 +218,8 @@ def _scanned(
 
     def body(params: Any, state: Any, arrival: Any) -> tuple[Any, Any]:
         measurement, time, seen = arrival
+        if complete:
+            measurement = measurement._replace(mask=jnp.ones(measurement.mask.shape, bool))
         to = time if clock == "arrival" else None
         moved = advance(estimator, params, state, measurement, to)
         shown = moved.reported

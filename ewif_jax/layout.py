@@ -151,7 +151,7 @@ def group_size(runs: int, state_bytes: int) -> int:
     or 1 where that would leave too few to fill vectors (a state that large is a vector itself)."""
     room = max(_CACHE // max(state_bytes, 1), 1)
     best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
-    return best if best >= 16 or room >= runs else 1 if room < 16 else runs
+    return best if best >= 16 else runs if room >= min(runs, 16) else 1
 
 
 _CACHE = 2**19

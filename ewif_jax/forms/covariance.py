@@ -10,7 +10,7 @@ from ewif_jax import checks
 from ewif_jax.estimator import verdict
 from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import symmetric
-from ewif_jax.models import Model, flow, sight
+from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
@@ -47,14 +47,14 @@ def covariance_form(
         ahead = jnp.maximum(time, state.time)
         mean, F, Q = flow(model, params, state.mean, state.time, ahead)
         checks.shape("F", F, (state.mean.shape[0],) * 2)
-        cov = symmetric.congruence(F, state.cov)
-        if inflation is not None:
-            cov = cov * _saturated(inflation(params, state.time, ahead), cov)
-        cov = cov + symmetric.pack(Q)
         known = time >= state.time
-        return CovarianceState(
-            time, jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan)
-        )
+        if inflation is None:
+            cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
+        else:
+            cov = symmetric.congruence(F, state.cov, patterns(model)[0])
+            cov = cov * _saturated(inflation(params, state.time, ahead), cov) + symmetric.pack(Q)
+            cov = jnp.where(known, cov, jnp.nan)
+        return CovarianceState(time, jnp.where(known, mean, jnp.nan), cov)
 
     def update(
         params: Any, state: CovarianceState, measurement: Measurement
@@ -86,7 +86,8 @@ def measure(
     checks.shape("H", H, ("m", mean.shape[0]))
     checks.shape("R", R, (H.shape[0],) * 2)
     difference = model.residual(measurement.value, predicted, measurement.sensor)
-    return updated(model, mean, cov, Compared(difference, H, R, measurement.mask))
+    seen = Compared(difference, H, R, measurement.mask)
+    return updated(model, mean, cov, seen, patterns(model)[1])
 
 
 def _saturated(factor: Array, cov: Array) -> Array:

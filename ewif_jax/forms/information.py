@@ -15,8 +15,9 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.batched import kernel, total
 from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.kernels.sparse import transposed
 from ewif_jax.models import Model
-from ewif_jax.models.model import affine_flow, observation, size
+from ewif_jax.models.model import affine_flow, observation, patterns, size
 from ewif_jax.types import Gaussian, Info, Measurement
 
 
@@ -58,12 +59,14 @@ def transport(
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
     A, _ = affine_flow(model, params, time, state.time, dtype)
-    mean = matvec(F, state.mean)
+    F_where, _ = patterns(model)
+    back = transposed(F_where)
+    mean = matvec(F, state.mean, F_where)
     return InformationState(
         time,
         mean if c is None else mean + c,
-        weight * symmetric.congruence(A.T, state.matrix),
-        weight * matvec(A.T, state.vector),
+        weight * symmetric.congruence(A.T, state.matrix, back),
+        weight * matvec(A.T, state.vector, back),
     )
 
 
@@ -128,9 +131,10 @@ def _sight(
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     checks.shape("H", H, ("m", state.mean.shape[0]))
     checks.shape("R", R, (H.shape[0],) * 2)
-    there = matvec(A, state.mean)
+    F_where, H_where = patterns(model)
+    there = matvec(A, state.mean, F_where)
     there = there if c is None else there + c
-    difference = model.residual(measurement.value, matvec(H, there), measurement.sensor)
+    difference = model.residual(measurement.value, matvec(H, there, H_where), measurement.sensor)
     seen = jnp.where(mask[:, None], matmul(H, A), 0)
     return seen, jnp.where(mask, difference, 0), R
 

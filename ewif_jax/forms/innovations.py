@@ -7,6 +7,7 @@ from jax import Array
 
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.sparse import Pattern
 from ewif_jax.models.model import Model
 from ewif_jax.types import Info, Status
 
@@ -46,11 +47,13 @@ def sound(model: Model, cov: Array, seen: Compared) -> tuple[Compared, Array]:
     return Compared(difference, H, R, mask & good), good
 
 
-def updated(model: Model, mean: Array, cov: Array, seen: Compared) -> tuple[Array, Array, Info]:
-    """Mean and packed covariance after a measurement, with its `Info` (delay 0, status USED or
-    REJECTED)."""
+def updated(
+    model: Model, mean: Array, cov: Array, seen: Compared, H_where: Pattern | None = None
+) -> tuple[Array, Array, Info]:
+    """Mean and packed covariance after a measurement whose H may differ from zero `H_where`, with
+    its `Info` (delay 0, status USED or REJECTED)."""
     (difference, H, R, mask), good = sound(model, cov, seen)
-    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
+    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask, H_where)
     info = Info(
         innovation.value,
         innovation.cov,

@@ -29,12 +29,15 @@ _APART: set[Function] = set()
 """Kept as functions of their own even without a batch."""
 
 
-def kernel(fn: Function) -> Function:
+def kernel(fn: Function, cheap: bool = False) -> Function:
     """`fn`, batched along trailing axes.
 
     `fn` takes arrays and returns a float array, or a tuple of them. The trailing axes of its
-    arguments, equally many for all, are equal or 1: it must treat them elementwise.
+    arguments, equally many for all, are equal or 1: it must treat them elementwise. `cheap`:
+    computing it again costs less than keeping it.
     """
+    if cheap:
+        _CHEAP.add(fn)
 
     @wraps(fn)
     def call(*args: Any) -> Any:
@@ -45,12 +48,9 @@ def kernel(fn: Function) -> Function:
 
 
 def linear_kernel(fn: Function, adjoint: Function, cheap: bool = False) -> Function:
-    """The kernel of a linear function of one array whose adjoint is known; `cheap`: computing it
-    again costs less than keeping it."""
+    """The kernel of a linear function of one array whose adjoint is known."""
     _ADJOINTS[fn], _ADJOINTS[adjoint] = adjoint, fn
-    if cheap:
-        _CHEAP.add(fn)
-    return kernel(fn)
+    return kernel(fn, cheap)
 
 
 def total(terms: Iterable[Array]) -> Array:

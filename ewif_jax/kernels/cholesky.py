@@ -4,6 +4,7 @@ A pivot that is zero to rounding is skipped (its row of the solution is zero), s
 by zero and gradients stay finite where a matrix is singular.
 """
 
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -71,62 +72,77 @@ def half_log_det(f: Factor) -> Array:
 
 
 @cache
-def _factor(tolerance: float):
+def _factor(tolerance: float) -> Callable[[Array], tuple[Array, Array]]:
     return kernel(lambda a: _factored(a, tolerance))
 
 
 @cache
-def _solved(tolerance: float):
-    return kernel(lambda a, b: jnp.stack(_solve_rows(*_factored(a, tolerance), b)))
+def _solved(tolerance: float) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, b: _solve_rows(*_factored(a, tolerance), b))
 
 
 def _factored(a: Array, tolerance: float) -> tuple[Array, Array]:
-    n = a.shape[0]
     columns, reciprocals = [], []
-    for j in range(n):
-        rest = _less(n, a[:, j], [c[j] for c in columns], columns)
-        kept = rest[j] > tolerance * a[j, j]
-        reciprocals.append(jnp.where(kept, lax.rsqrt(jnp.where(kept, rest[j], 1)), 0))
-        below = np.arange(n).reshape(n, *(1,) * (a.ndim - 2)) >= j
-        columns.append(jnp.where(below, rest * reciprocals[j][None], 0))
+    for j in range(a.shape[0]):
+        column, reciprocal = _apart(_column(j, tolerance), a, *columns, batch=a.ndim - 2)
+        columns.append(column)
+        reciprocals.append(reciprocal)
     return jnp.stack(columns, 1), jnp.stack(reciprocals)
 
 
-def _forward_rows(lower: Array, reciprocal: Array, b: Array | list[Array]) -> list[Array]:
+@cache
+def _column(j: int, tolerance: float) -> Callable[..., tuple[Array, Array]]:
+    """(a, columns before j) -> column j of the factor, and the reciprocal of its pivot."""
+
+    def column(a: Array, *columns: Array) -> tuple[Array, Array]:
+        rest = _less(a[:, j], [c[j] for c in columns], columns)
+        kept = rest[j] > tolerance * a[j, j]
+        reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, rest[j], 1)), 0)
+        below = np.arange(a.shape[0]).reshape(-1, *(1,) * (a.ndim - 2)) >= j
+        return jnp.where(below, rest * reciprocal[None], 0), reciprocal
+
+    return column
+
+
+def _forward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
     x: list[Array] = []
-    for j in range(len(b)):
-        x.append(_times(_less(len(b), b[j], lower[j, :j], x), reciprocal[j]))
-    return x
+    for j in range(b.shape[0]):
+        x.append(_apart(_row(j, True), lower, reciprocal, b, *x, batch=lower.ndim - 2))
+    return jnp.stack(x)
 
 
-def _backward_rows(lower: Array, reciprocal: Array, b: Array | list[Array]) -> list[Array]:
+def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
     x: list[Array] = []
-    for j in reversed(range(len(b))):
-        x.insert(0, _times(_less(len(b), b[j], lower[j + 1 :, j], x), reciprocal[j]))
-    return x
+    for j in reversed(range(b.shape[0])):
+        x.insert(0, _apart(_row(j, False), lower, reciprocal, b, *x, batch=lower.ndim - 2))
+    return jnp.stack(x)
 
 
-def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> list[Array]:
+def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
     return _backward_rows(lower, reciprocal, _forward_rows(lower, reciprocal, b))
 
 
-_forward, _backward, _solve = (
-    kernel(lambda *args, rows=rows: jnp.stack(rows(*args)))
-    for rows in (_forward_rows, _backward_rows, _solve_rows)
-)
+_forward, _backward, _solve = map(kernel, (_forward_rows, _backward_rows, _solve_rows))
 
 
-def _less(n: int, b: Array, numbers: Any, arrays: list[Array]) -> Array:
-    """b minus the sum of numbers times arrays; kept apart where recomputing steps would add up."""
-    if n <= 3 or not arrays:
-        return _minus_products(b, *numbers, *arrays)
-    batch = numbers[0].ndim  # a number and its batch axes
-    return stage(_minus_products, b, *numbers, *arrays, batch=batch)
+@cache
+def _row(j: int, down: bool) -> Callable[..., Array]:
+    """(lower, reciprocals, b, rows solved before) -> row j of the solution."""
+
+    def row(lower: Array, reciprocal: Array, b: Array, *x: Array) -> Array:
+        return _times(_less(b[j], lower[j, :j] if down else lower[j + 1 :, j], x), reciprocal[j])
+
+    return row
 
 
-def _minus_products(b: Array, *factors: Array) -> Array:
-    count = len(factors) // 2
-    for number, array in zip(factors[:count], factors[count:], strict=True):
+def _apart(fn: Callable[..., Any], *args: Array, batch: int) -> Any:
+    """`fn` of arrays, the first of them (n, n), computed once where recomputing would add up."""
+    return stage(fn, *args, batch=batch) if args[0].shape[0] > 3 else fn(*args)
+
+
+def _less(b: Array, numbers: Any, arrays: Sequence[Array]) -> Array:
+    """b minus the sum of numbers times arrays."""
+    for number, array in zip(numbers, arrays, strict=True):
         b = b - _times(array, number)
     return b
 

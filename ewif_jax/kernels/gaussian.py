@@ -1,5 +1,7 @@
 """The measurement update of a Gaussian: masked, singular-safe, Joseph-stabilised."""
 
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from jax import Array
 
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.batched import kernel, total
-from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.sparse import Pattern, by_row, full
 
 
 class Innovation(NamedTuple):
@@ -51,21 +53,41 @@ def gain(innovation: Innovation) -> Array:
 
 
 def update(
-    mean: Array, packed: Array, difference: Array, H: Array, R: Array, mask: Array
+    mean: Array,
+    packed: Array,
+    difference: Array,
+    H: Array,
+    R: Array,
+    mask: Array,
+    H_where: Pattern | None = None,
 ) -> tuple[Array, Array, Innovation]:
     """Mean and packed covariance after a linear(ised) measurement, with the innovation.
 
-    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,). The covariance is
+    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,); H may differ from
+    zero `H_where`. The covariance is
     (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
     result of the first, which is what makes the Joseph form forget rounding errors of the gain.
     """
-    cross = symmetric.rows(H, packed)
-    innovation = innovate(difference, cross, matmul(cross, H.T) + R, mask)
-    weights = cholesky.solved(innovation.cov, innovation.cross)
+    H, R = jnp.where(mask[:, None], H, 0), mask_cov(R, mask)
+    cross = symmetric.rows(H, packed, H_where)
+    cov = _expected(H_where)(cross, H, R)
+    innovation = Innovation(jnp.where(mask, difference, 0), cov, cholesky.factor(cov), cross)
+    weights = cholesky.solve(innovation.factor, cross)
     mean = _moved(mean, weights, innovation.value)
-    half = _reduced(packed, innovation.cross, weights)
-    packed = _joseph(half, symmetric.rows(H, half), mask_cov(R, mask), weights)
-    return mean, packed, innovation
+    half = _less(packed, cross, weights)
+    left_over = _left_over(R, weights, symmetric.rows(H, half, H_where))
+    return mean, _more(half, weights, left_over), innovation
+
+
+@cache
+def _expected(where: Pattern | None) -> Callable[[Array, Array, Array], Array]:
+    @kernel
+    def expected(cross: Array, H: Array, R: Array) -> Array:
+        """H P H' + R, from H P."""
+        terms = by_row(H, where or full(*H.shape[:2]))
+        return R + total(cross[:, column] * factor[None] for factor, column in terms)
+
+    return expected
 
 
 @kernel
@@ -75,18 +97,23 @@ def _moved(mean: Array, weights: Array, value: Array) -> Array:
 
 
 @kernel
-def _reduced(packed: Array, cross: Array, weights: Array) -> Array:
+def _less(packed: Array, cross: Array, weights: Array) -> Array:
     """P - P H' K', packed."""
     rows, cols = np.triu_indices(cross.shape[1])
     return packed - _contract(cross[:, rows], weights[:, cols])
 
 
 @kernel
-def _joseph(half: Array, seen: Array, R: Array, weights: Array) -> Array:
-    """half + K (R K' - H half), packed; `seen` = H half."""
+def _left_over(R: Array, weights: Array, seen: Array) -> Array:
+    """R K' - H half; `seen` = H half."""
+    return _contract(R[:, :, None], weights[:, None, :]) - seen
+
+
+@kernel
+def _more(half: Array, weights: Array, left_over: Array) -> Array:
+    """half + K left_over, packed."""
     rows, cols = np.triu_indices(weights.shape[1])
-    correction = _contract(R[:, :, None], weights[:, None, :]) - seen
-    return half + _contract(weights[:, rows], correction[:, cols])
+    return half + _contract(weights[:, rows], left_over[:, cols])
 
 
 def _contract(a: Array, b: Array) -> Array:

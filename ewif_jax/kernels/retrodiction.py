@@ -1,20 +1,9 @@
-"""A late measurement seen from now: what the process noise since then does to it."""
+"""The inside of an interval, seen from its ends."""
 
 from jax import Array
 
-from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import fence, matmul
-
-
-def noise_gain(predicted_cov: Array, Q: Array) -> tuple[Array, Array]:
-    """Q M^-1 (n, n) and L^-1 Q (n, n) with M = L L', the packed `predicted_cov`.
-
-    Q M^-1 maps "new estimate minus prediction" to the expected process noise. Q is part of M, so a
-    singular M needs no inverse: directions without variance are skipped.
-    """
-    f = cholesky.factor(symmetric.unpack(predicted_cov))
-    root = fence(cholesky.forward(f, Q))
-    return fence(cholesky.backward(f, root).T), root
+from ewif_jax.kernels import cholesky
+from ewif_jax.kernels.small import matmul
 
 
 def bridge(Q_before: Array, F_after: Array, Q_after: Array) -> tuple[Array, Array]:

@@ -6,6 +6,9 @@ last (contiguous) axis, and a product of two batched factors becomes a sum of el
 Both are exact rewritings; only the layout differs from `jnp.matmul`.
 """
 
+from collections.abc import Callable
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -13,7 +16,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ewif_jax.kernels.batched import contiguous, stage, total
+from ewif_jax.kernels.batched import contiguous, kernel, stage, total
+from ewif_jax.kernels.sparse import Pattern, product
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -21,18 +25,15 @@ def matmul(a: Array, b: Array) -> Array:
     return _matmul_p.bind(a, b)
 
 
-def matvec(a: Array, x: Array) -> Array:
-    """`a @ x` for a matrix and a vector, with the batching of `matmul`."""
-    return matmul(a, x[:, None])[:, 0]
+def matvec(a: Array, x: Array, where: Pattern | None = None) -> Array:
+    """`a @ x` for a matrix, which may differ from zero `where`, and a vector, with the batching of
+    `matmul`."""
+    return matmul(a, x[:, None])[:, 0] if where is None else _sparse(where)(a, x)
 
 
-def fence(x: Array) -> Array:
-    """`x`, computed once: a product with the identity, which XLA does not fuse into its users.
-
-    Without it XLA recomputes cheap-looking chains for every element that reads them.
-    """
-    rows = x.reshape(x.shape[0], -1)
-    return matmul(jnp.eye(x.shape[0], dtype=x.dtype), rows).reshape(x.shape)
+@cache
+def _sparse(where: Pattern) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, x: product(a, x, where), cheap=True)
 
 
 def _dot(a: Array, b: Array) -> Array:

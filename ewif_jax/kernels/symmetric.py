@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
+from ewif_jax.kernels.sparse import Pattern, by_row, elements, full, pattern, terms
 
 
 def order(packed: Array) -> int:
@@ -67,17 +68,24 @@ def unpack(packed: Array) -> Array:
     return _unpack(packed)
 
 
-def congruence(a: Array, packed: Array) -> Array:
-    """a P a' for a square matrix a and a packed P, packed.
+def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
+    """a P a' for a square matrix a and a packed P, packed; `where` a may differ from zero.
 
     With a shared by the batch this is one product with a's second power.
     """
-    return _congruence(a, packed)
+    return _congruence(where)(a, packed)
 
 
-def rows(a: Array, packed: Array) -> Array:
-    """a P (m, n) for a matrix a (m, n) and a packed P."""
-    return _rows(a, packed)
+def propagated(
+    a: Array, packed: Array, plus: Array, known: Array, where: Pattern | None = None
+) -> Array:
+    """a P a' + plus, packed, NaN unless `known` ()."""
+    return _propagated(where)(a, packed, plus, known)
+
+
+def rows(a: Array, packed: Array, where: Pattern | None = None) -> Array:
+    """a P (m, n) for a matrix a (m, n) and a packed P; `where` a may differ from zero."""
+    return _rows(where)(a, packed)
 
 
 def times(packed: Array, x: Array) -> Array:
@@ -148,35 +156,78 @@ def _times(packed: Array, x: Array) -> Array:
     return total(full[:, k] * x[None, k] for k in range(x.shape[0]))
 
 
-@kernel
-def _rows(a: Array, packed: Array) -> Array:
-    n = a.shape[1]
-    where = places(n)
-    columns = [total(a[:, k] * packed[where[k, j]][None] for k in range(n)) for j in range(n)]
-    return jnp.stack(columns, 1)
+@cache
+def _rows(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, packed: _left(a, packed, where))
 
 
-@kernel
-def _congruence(a: Array, packed: Array) -> Array:
+@cache
+def _congruence(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, packed: _moved(a, packed, where))
+
+
+@cache
+def _propagated(where: Pattern | None) -> Callable[..., Array]:
+    @kernel
+    def moved(a: Array, packed: Array, plus: Array, known: Array) -> Array:
+        return jnp.where(known[None], _moved(a, packed, where) + plus, jnp.nan)
+
+    return moved
+
+
+@cache
+def _half(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return lambda a, packed: _left(a, packed, where)
+
+
+def _left(a: Array, packed: Array, where: Pattern | None) -> Array:
+    """a P (m, n)."""
+    at = places(a.shape[1])
+    return total(f[:, None] * packed[at[k]] for f, k in by_row(a, where or full(*a.shape[:2])))
+
+
+def _moved(a: Array, packed: Array, where: Pattern | None) -> Array:
+    """a P a', packed."""
     n, batch = a.shape[0], packed.ndim - 1
+    where = where or full(n, n)
+    if batch and a.size == n * n:
+        return _shared(a, packed, where)
+    half = stage(_half(where), a, packed, batch=batch) if batch else _left(a, packed, where)
     rows, cols = np.triu_indices(n)
-    if batch == 0:
-        half = _left(a, packed)
-        return _pick(total(half[:, k, None] * a[None, :, k] for k in range(n)))
-    if a.size > n * n:
-        half = stage(_left, a, packed, batch=batch)
-        return total(half[rows, k] * a[cols, k] for k in range(n))
-    flat = a.reshape(n * n)
+    return total(half[rows, k[cols]] * f[cols] for f, k in by_row(a, where))
 
-    def minor(i: np.ndarray, j: np.ndarray) -> Array:
-        return flat[i[:, None] * n + j[None, :]]
 
-    twice = np.asarray(rows != cols, a.dtype)[None, :]
-    power = minor(rows, rows) * minor(cols, cols) + twice * minor(rows, cols) * minor(cols, rows)
-    moved = lax.dot(power, packed.reshape(rows.size, -1), precision=lax.Precision.HIGHEST)
+def _shared(a: Array, packed: Array, where: Pattern) -> Array:
+    """a P a' with the second power of an a without a batch, as a product or term by term."""
+    columns, _ = terms(_squared(where))
+    size = columns.shape[1]
+    few = 2 * len(columns) < size
+    power = stage(_second_power(where, few), a, batch=packed.ndim - 1)
+    if few:
+        return total(power[:, t] * packed[at] for t, at in enumerate(columns))
+    flat = packed.reshape(size, -1)
+    moved = lax.dot(power.reshape(size, size), flat, precision=lax.Precision.HIGHEST)
     return moved.reshape(packed.shape)
 
 
-def _left(a: Array, packed: Array) -> Array:
-    full = _spread(packed)
-    return total(a[:, k, None] * full[None, k] for k in range(a.shape[0]))
+@cache
+def _second_power(where: Pattern, few: bool) -> Callable[[Array], Array]:
+    """a -> what each element of P, or few of them, count in each of a P a'."""
+    taken, counts = terms(_squared(where) if few else full(*2 * (len(_squared(where)),)))
+
+    def power(a: Array) -> Array:
+        rows, cols = np.triu_indices(a.shape[0])
+        i, j, k, m = rows[:, None], cols[:, None], rows[taken.T], cols[taken.T]
+        straight = elements(a, i, k, counts.T) * elements(a, j, m, counts.T)
+        return straight + elements(a, i, m, counts.T & (k != m)) * elements(a, j, k, counts.T)
+
+    return power
+
+
+@cache
+def _squared(where: Pattern) -> Pattern:
+    """Which elements of P each element of a P a' takes."""
+    flags = np.asarray(where, bool)
+    rows, cols = np.triu_indices(len(where))
+    straight = flags[np.ix_(rows, rows)] & flags[np.ix_(cols, cols)]
+    return pattern(straight | flags[np.ix_(rows, cols)] & flags[np.ix_(cols, rows)])

@@ -13,6 +13,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.small import matvec
+from ewif_jax.kernels.sparse import pattern
 from ewif_jax.models.model import Linear, Model, affine_motion, resolve
 from ewif_jax.models.sensors import Sensor, bank
 
@@ -87,7 +88,10 @@ def _kinematic(
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
         return resolve(q, params) * _polynomial(Q_terms, t1 - t0)
 
-    linear = None if matrix is None else Linear(F, b, matrix(n))
+    linear = None
+    if matrix is not None:
+        H, H_where = matrix(n)
+        linear = Linear(F, b, H, pattern(*F_terms), H_where)
     transition = affine_motion(F, b)
     return Model(transition, process_cov, observe, cov, residual, linear, count)
 

@@ -10,6 +10,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.small import matvec
+from ewif_jax.kernels.sparse import Pattern, pattern
 from ewif_jax.models.sensor_range import check_sensor
 
 
@@ -28,11 +29,15 @@ class Linear(NamedTuple):
     """The matrices of a linear model: x(t1) = F x(t0) + b, z = H x.
 
     F(params, t0, t1) -> (n, n); b(params, t0, t1) -> (n,) or None; H(params, sensor, t) -> (m, n).
+    F_where and H_where: where F (in either direction) and H may differ from zero, if that is known;
+    what is zero is not computed.
     """
 
     F: Callable[..., Array]
     b: Callable[..., Array] | None
     H: Callable[..., Array]
+    F_where: Pattern | None = None
+    H_where: Pattern | None = None
 
 
 class Model(NamedTuple):
@@ -77,6 +82,7 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
         ValueError: a constant has the wrong shape, or a constant Q or R is not PSD; tables H and R
             speak of different numbers of sensors.
     """
+    given = F, H
     F, n = _one_step(F)
     if not callable(Q) and Q is not None:
         checks.psd("Q", Q)
@@ -100,7 +106,8 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
     def measurement_cov(params: Any, sensor: Array, t: Array) -> Array:
         return jnp.asarray(R(params, sensor, t))
 
-    transition, linear = affine_motion(F, b), Linear(F, b, H)
+    transition = affine_motion(F, b)
+    linear = Linear(F, b, H, _pattern_of_powers(given[0]), _pattern_of_table(given[1]))
     return Model(transition, process_cov, observe, measurement_cov, subtract, linear, sensors)
 
 
@@ -131,7 +138,7 @@ def flow(model: Model, params: Any, x: Array, t0: Array, t1: Array) -> tuple[Arr
     Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
     if model.linear is not None:
         F, c = affine_flow(model, params, t0, t1, x.dtype)
-        moved = matvec(F, x)
+        moved = matvec(F, x, model.linear.F_where)
         return (moved if c is None else moved + c), F, Q
 
     def move(x: Array) -> Array:
@@ -152,12 +159,17 @@ def sight(
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     if model.linear is not None:
         H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
-        return matvec(H, x), H, R
+        return matvec(H, x, model.linear.H_where), H, R
 
     def see(x: Array) -> Array:
         return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
 
     return see(x), jax.jacfwd(see)(x), R
+
+
+def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:
+    """Where F and H of a model may differ from zero, if that is known."""
+    return (None, None) if model.linear is None else (model.linear.F_where, model.linear.H_where)
 
 
 def observation(
@@ -231,6 +243,20 @@ def _one_step(F: Any) -> tuple[Any, int | None]:
         return jnp.where(t1 > t0, ahead, jnp.where(t1 < t0, back, still))
 
     return matrix, n
+
+
+def _pattern_of_powers(F: Any) -> Pattern | None:
+    """Where any power of a constant F, and so its inverse, may differ from zero."""
+    if callable(F):
+        return None
+    n = np.shape(F)[0]
+    return pattern(np.linalg.matrix_power((np.asarray(F) != 0) + np.eye(n), n))
+
+
+def _pattern_of_table(H: Any) -> Pattern | None:
+    """Where a constant matrix, or any of a table, may differ from zero."""
+    known = None if callable(H) else checks.known(H)
+    return None if known is None else pattern(*known.reshape(-1, *known.shape[-2:]))
 
 
 def _over_one_interval(value: Array) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.kernels.sparse import Pattern, pattern
 from ewif_jax.models.model import resolve, select
 
 
@@ -81,7 +82,8 @@ def _covariance(r: Any, m: int) -> Callable[..., Array]:
 def bank(
     sensors: Sensor | Sequence[Sensor],
 ) -> tuple[Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable | None, int]:
-    """observe, cov, residual and (if all are linear) matrix of sensors chosen by their index.
+    """observe, cov, residual and (if all are linear) matrix of sensors chosen by their index:
+    matrix(n) -> H(params, sensor, t), and where any H differs from zero.
 
     All sensors must have the same number of components. Returns the count last.
     """
@@ -113,8 +115,9 @@ def bank(
     if any(matrix is None for matrix in matrices):
         return observe, cov, residual, None, len(group)
 
-    def matrix(n: int) -> Callable[..., Array]:
-        table = [jnp.asarray(m(n)) for m in matrices if m is not None]
-        return lambda params, sensor, t: choose(table, sensor)
+    def matrix(n: int) -> tuple[Callable[..., Array], Pattern]:
+        known = [m(n) for m in matrices if m is not None]
+        table = [jnp.asarray(m) for m in known]
+        return (lambda params, sensor, t: choose(table, sensor)), pattern(*known)
 
     return observe, cov, residual, matrix, len(group)

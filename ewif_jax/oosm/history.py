@@ -10,9 +10,9 @@ from ewif_jax import checks
 from ewif_jax.estimator import choose, verdict
 from ewif_jax.forms.covariance import CovarianceState, covariance_form
 from ewif_jax.forms.innovations import Compared, updated
-from ewif_jax.kernels import retrodiction, slots, symmetric
-from ewif_jax.kernels.small import fence, matmul, matvec
-from ewif_jax.models import Model, flow, sight
+from ewif_jax.kernels import cholesky, slots, symmetric
+from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
@@ -100,21 +100,22 @@ def late_update(
     at = jnp.clip(measurement.time, start.time, state.time)
     predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
-    M = symmetric.congruence(F, start.cov) + symmetric.pack(Q_all)
+    M = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
-    gain, root = retrodiction.noise_gain(M, Q)
+    f = cholesky.factor(symmetric.unpack(M))  # Q is part of M: what M has not, Q has not
+    origin = state.mean
     if noise_estimated:
-        origin = state.mean - matvec(gain, state.mean - predicted)
-        left_over = Q - matmul(root.T, root)
-    else:
-        origin = state.mean
-        left_over = Q - symmetric.unpack(symmetric.congruence(gain, state.cov))
+        origin = origin - matvec(Q, cholesky.solve(f, state.mean - predicted))
     there, back, _ = flow(model, params, origin, state.time, at)
     value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    seen = fence(matmul(H, back))
-    H_now = fence(seen - matmul(seen, gain))
-    R_now = fence(R + matmul(matmul(seen, left_over), seen.T))
+    seen = matmul(H, back)
+    noisy = matmul(seen, Q)
+    root = cholesky.forward(f, noisy.T)
+    weights = cholesky.backward(f, root)
+    H_now = seen - weights.T
+    known = root if noise_estimated else matmul(symmetric.unpack(state.cov), weights)
+    R_now = R + matmul(noisy, seen.T) - matmul((root if noise_estimated else weights).T, known)
     difference = model.residual(measurement.value, value, measurement.sensor)
     seen = Compared(difference, H_now, R_now, measurement.mask)
     return updated(model, state.mean, state.cov, seen)

@@ -1,0 +1,69 @@
+"""Small matrices whose zeros are known before anything runs: what is zero is not multiplied."""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ewif_jax.kernels.batched import total
+
+Pattern = tuple[tuple[bool, ...], ...]
+"""Row by row, where a matrix may differ from zero."""
+
+
+def pattern(*matrices: np.ndarray) -> Pattern:
+    """Where any of these (rows, columns) is not zero."""
+    anywhere = np.any([np.asarray(m) != 0 for m in matrices], 0)
+    return tuple(tuple(bool(x) for x in row) for row in anywhere)
+
+
+def transposed(where: Pattern | None) -> Pattern | None:
+    """The pattern of the transpose."""
+    return None if where is None else tuple(zip(*where, strict=True))
+
+
+class Terms(NamedTuple):
+    """Row by row the columns of a sparse matrix, (T, rows); a row with fewer than T elements goes
+    on with its first column, and `counts` False."""
+
+    columns: np.ndarray
+    counts: np.ndarray
+
+
+@cache
+def terms(where: Pattern) -> Terms:
+    """What each row multiplies."""
+    flags = np.asarray(where, bool)
+    count = flags.sum(1)
+    t = np.arange(max(int(count.max(initial=0)), 1))[:, None]
+    order = np.argsort(~flags, axis=1, kind="stable")
+    counts = t < count
+    return Terms(np.where(counts, order.T[: len(t)], order[:, 0]), counts)
+
+
+def full(rows: int, cols: int) -> Pattern:
+    """The pattern of a matrix of which nothing is known."""
+    return ((True,) * cols,) * rows
+
+
+def elements(a: Array, rows: np.ndarray, cols: np.ndarray, counts: np.ndarray) -> Array:
+    """a[rows, cols] of a matrix (n, k, ...) where it `counts`, else 0."""
+    picked = a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])[rows * a.shape[1] + cols]
+    if counts.all():
+        return picked
+    return picked * jnp.asarray(counts, a.dtype).reshape(counts.shape + (1,) * (a.ndim - 2))
+
+
+def by_row(a: Array, where: Pattern) -> list[tuple[Array, np.ndarray]]:
+    """The terms of a product with a matrix a (rows, k, ...): what each row multiplies (rows, ...),
+    and which column (rows,)."""
+    columns, counts = terms(where)
+    factors = elements(a, np.arange(a.shape[0])[:, None], columns.T, counts.T)
+    return [(factors[:, t], column) for t, column in enumerate(columns)]
+
+
+def product(a: Array, x: Array, where: Pattern) -> Array:
+    """a x for a matrix a (rows, k, ...) and a vector x (k, ...)."""
+    return total(factor * x[column] for factor, column in by_row(a, where))
