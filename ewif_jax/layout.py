@@ -141,8 +141,8 @@ def scan_in_blocks(
 
 
 def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 64, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 64) + 1) if steps % d == 0)
+    """The largest divisor of `steps` up to 48, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 48) + 1) if steps % d == 0)
     return best if best >= 16 else steps
 
 

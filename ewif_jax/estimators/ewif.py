@@ -86,6 +86,6 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
         del params
-        return form.estimate(state)
+        return form.settled(state)
 
     return Estimator(init, predict, update, estimate)

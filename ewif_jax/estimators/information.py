@@ -73,6 +73,6 @@ def information(model: Model) -> Estimator:
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
         del params
-        return form.estimate(state)
+        return form.settled(state)
 
     return Estimator(init, predict, update, estimate)

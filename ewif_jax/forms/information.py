@@ -120,6 +120,16 @@ def estimate(state: InformationState) -> Gaussian:
     )
 
 
+def settled(state: InformationState) -> Gaussian:
+    """The estimate of a state that is `recentred` whenever there is one: the reference itself."""
+    cov, full_rank = symmetric.inverse(state.matrix)
+    centred = full_rank & jnp.all(state.vector == 0)
+    return Gaussian(
+        jnp.where(centred, state.mean, jnp.nan),
+        jnp.where(full_rank, symmetric.unpack(cov), jnp.nan),
+    )
+
+
 def _sight(
     model: Model, params: Any, state: InformationState, measurement: Measurement
 ) -> tuple[Array, Array, Array]:
