@@ -22,8 +22,8 @@ QUICKEST: Mapping[str, Any] = {**QUICK, "xla_backend_optimization_level": 0}
 
 
 def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str, Any]) -> Any:
-    """`jax.jit`, with these options where this XLA knows them and nothing is transformed (a
-    program inside another cannot have its own)."""
+    """`jax.jit`, with these options on a CPU, where this XLA knows them and nothing is transformed
+    (a program inside another cannot have its own)."""
     plain = jax.jit(fn, static_argnames=static_argnames)
     quick = jax.jit(fn, static_argnames=static_argnames, compiler_options=dict(options))
 
@@ -39,6 +39,8 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
 
 @cache
 def _known() -> bool:
+    if jax.default_backend() != "cpu":
+        return False
     try:
         jax.jit(lambda: 0, compiler_options=dict(QUICKEST))()
     except JaxRuntimeError:

@@ -99,9 +99,7 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    measurements, state = validated(
-        estimator, params, measurements, prior, t0, times, clock, key
-    )
+    measurements, state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = _prior(prior, measurements.value.dtype)
     filtered = _compiled(measurements.time.shape[0], state, key)
     return filtered(estimator, params, measurements, prior, t0, times, clock, key)
@@ -145,13 +143,14 @@ def validated(
     shapes = jnp.shape(measurements.value), times is None, clock
     last = None if sensors is None else sensors.max()
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
-    if trial is None:
-        return measurements, jax.eval_shape(first).kept
-    if trial not in _tried:
+    state = None if trial is None else _tried.get(trial)
+    if state is None:
+        state = jax.eval_shape(first).kept
+    if trial is not None:
         if len(_tried) >= 1000:
             _tried.clear()
-        _tried[trial] = jax.eval_shape(first).kept
-    return measurements, _tried[trial]
+        _tried[trial] = state
+    return measurements, state
 
 
 _tried: dict[Any, Any] = {}
@@ -272,8 +271,8 @@ def _filtered(
 
 
 def _compiled(arrivals: int, state: Any, key: Any) -> Any:
-    """`_filtered`, compiled as hard as it is worth for so many arrivals and such a state."""
-    longest = max(x.shape[-1] for x in jax.tree.leaves(state) if x.ndim)
+    """`_filtered`, compiled as hard as so many arrivals and such a state deserve."""
+    longest = max((x.shape[-1] for x in jax.tree.leaves(state) if x.ndim), default=1)
     if arrivals * max(longest, 100) <= 1e5:
         return _run_short
     # What draws random numbers has many members, and fills vectors.

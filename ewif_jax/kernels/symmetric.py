@@ -150,6 +150,8 @@ def _times(packed: Array, x: Array) -> Array:
 
 @kernel
 def _rows(a: Array, packed: Array) -> Array:
+    if packed.ndim == 1:
+        return _left(a, packed)
     n = a.shape[1]
     where = places(n)
     columns = [total(a[:, k] * packed[where[k, j]][None] for k in range(n)) for j in range(n)]
@@ -179,4 +181,4 @@ def _congruence(a: Array, packed: Array) -> Array:
 
 def _left(a: Array, packed: Array) -> Array:
     full = _spread(packed)
-    return total(a[:, k, None] * full[None, k] for k in range(a.shape[0]))
+    return total(a[:, k, None] * full[None, k] for k in range(a.shape[1]))
