@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.compiling import quick_jit
+from ewif_jax.compiling import QUICK, QUICKEST, quick_jit
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 Clock = Literal["validity", "arrival"]
@@ -99,11 +99,9 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    measurements = validated(estimator, params, measurements, prior, t0, times, clock, key)
+    measurements, state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = _prior(prior, measurements.value.dtype)
-    # What draws random numbers has many members, and fills vectors.
-    wide = key is not None and measurements.time.shape[0] > 100
-    filtered = _run_wide if wide else _run_small
+    filtered = _compiled(measurements.time.shape[0], state, key)
     return filtered(estimator, params, measurements, prior, t0, times, clock, key)
 
 
@@ -116,8 +114,9 @@ def validated(
     times: Any,
     clock: str,
     key: Any,
-) -> Measurement:
-    """The stream in one float dtype, after everything that can be known now has been checked."""
+) -> tuple[Measurement, Any]:
+    """The stream in one float dtype, after everything that can be known now has been checked, and
+    the shapes of the estimator's state."""
     checks.stream(measurements)
     checks.prior(prior)
     checks.shape("t0", t0, ())
@@ -144,16 +143,19 @@ def validated(
     shapes = jnp.shape(measurements.value), times is None, clock
     last = None if sensors is None else sensors.max()
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
-    if trial is None or trial not in _tried:
-        jax.eval_shape(first)
+    state = None if trial is None else _tried.get(trial)
+    if state is None:
+        state = jax.eval_shape(first).kept
+    if trial is not None:
         if len(_tried) >= 1000:
             _tried.clear()
-        _tried.add(trial)
-    return measurements
+        _tried[trial] = state
+    return measurements, state
 
 
-_tried: set[Any] = set()
-"""What has gone through one trial arrival: trying takes longer than filtering a short stream."""
+_tried: dict[Any, Any] = {}
+"""What has gone through one trial arrival, and the shapes of the state that came out: trying takes
+longer than filtering a short stream."""
 
 
 def _fingerprint(structure: Any, values: Any) -> Any:
@@ -268,5 +270,16 @@ def _filtered(
     return Trace(time, mean, cov, info, state)
 
 
-_run_wide = jax.jit(_filtered, static_argnames=("estimator", "clock"))
-_run_small = quick_jit(_filtered, static_argnames=("estimator", "clock"))
+def _compiled(arrivals: int, state: Any, key: Any) -> Any:
+    """`_filtered`, compiled as hard as so many arrivals and such a state deserve."""
+    longest = max((x.shape[-1] for x in jax.tree.leaves(state) if x.ndim), default=1)
+    if arrivals * max(longest, 100) <= 1e5:
+        return _run_short
+    # What draws random numbers has many members, and fills vectors.
+    return _run_wide if key is not None and arrivals > 100 else _run_small
+
+
+_STATIC = ("estimator", "clock")
+_run_wide = jax.jit(_filtered, static_argnames=_STATIC)
+_run_small = quick_jit(_filtered, _STATIC, QUICK)
+_run_short = quick_jit(_filtered, _STATIC, QUICKEST)

@@ -66,7 +66,7 @@ def run_parallel(
     known = method in ("blocked", "associative")
     checks.require(known, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
-    measurements = validated(estimator, params, measurements, prior, t0, times, "validity", None)
+    measurements, _ = validated(estimator, params, measurements, prior, t0, times, "validity", None)
     steps = measurements.value.shape[0]
     if block is None:
         block = isqrt(steps - 1) + 1 if method == "blocked" else 1

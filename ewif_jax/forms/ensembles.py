@@ -4,7 +4,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose
@@ -53,9 +54,12 @@ def start(prior: Gaussian | None, t0: Any, key: Any, count: int, method: str) ->
 def noise(key: Array, root: Array, count: int) -> Array:
     """`count` draws (n, count) with covariance root root', moved so that their mean is zero.
 
-    Drawn in float32 whatever the dtype, so that single and double precision see the same noise.
+    Drawn from float32 whatever the dtype, so that single and double precision see the same noise:
+    uniform numbers, which are exact, so that how a program is compiled makes no difference.
     """
-    drawn = jax.random.normal(key, (root.shape[1], count), jnp.float32).astype(root.dtype)
+    above = np.nextafter(np.float32(-1), np.float32(0))
+    uniform = jax.random.uniform(key, (root.shape[1], count), jnp.float32, above, 1)
+    drawn = np.sqrt(2, dtype=root.dtype) * lax.erf_inv(uniform.astype(root.dtype))
     return matmul(root, drawn - jnp.mean(drawn, 1, keepdims=True))
 
 

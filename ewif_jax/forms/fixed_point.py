@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -58,17 +59,25 @@ def fixed_point(
         mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, time)
         return CovarianceState(time, mean, symmetric.congruence(F, state.cov) + symmetric.pack(Q))
 
-    def one(state: CovarianceState, measurement: Measurement) -> tuple[CovarianceState, None]:
+    def one(
+        state: CovarianceState, step: tuple[Measurement, Array]
+    ) -> tuple[CovarianceState, None]:
+        measurement, last = step
         inside = (measurement.time > tau) & (measurement.time < now)
-        inside = inside & jnp.any(measurement.mask)
-        moved = ahead(both, state, jnp.where(inside, measurement.time, state.time))
+        inside = inside & jnp.any(measurement.mask) & ~last
+        time = jnp.where(last, now, jnp.where(inside, measurement.time, state.time))
+        moved = ahead(both, state, time)
         mean, cov, _ = measure_around(both, points, params, moved.mean, moved.cov, measurement)
-        return choose(inside, CovarianceState(moved.time, mean, cov), state), None
+        measured = choose(inside, CovarianceState(time, mean, cov), state)
+        return choose(last, moved, measured), None
 
     there = ahead(model, start, tau)
     twice = jnp.tile(symmetric.unpack(there.cov), (2, 2))
     first = CovarianceState(tau, jnp.tile(there.mean, 2), symmetric.pack(twice))
-    last = ahead(both, lax.scan(one, first, measurements)[0], now)
+    # After the measurements once more, only to move on: a second copy would be compiled longer.
+    steps = jax.tree.map(lambda x: jnp.concatenate([x, x[-1:]]), measurements)
+    final = jnp.arange(steps.time.shape[0]) == measurements.time.shape[0]
+    last = lax.scan(one, first, (steps, final))[0]
     cov = symmetric.unpack(last.cov)
     f = cholesky.factor(cov[:n, :n])
     root = cholesky.forward(f, cov[:n, n:])

@@ -27,6 +27,8 @@ def _pushed(new: Array, table: Array, push: Array) -> Array:
 
 @kernel
 def _picked(table: Array, here: Array) -> Array:
+    if here.ndim == 1:
+        return jnp.sum(jnp.where(here.reshape(-1, *(1,) * (table.ndim - 1)), table, 0), 0)
     return total(
         jnp.where(_like(chosen, entry.ndim), entry, 0)
         for chosen, entry in zip(here, table, strict=True)
