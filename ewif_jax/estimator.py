@@ -143,14 +143,13 @@ def validated(
     shapes = jnp.shape(measurements.value), times is None, clock
     last = None if sensors is None else sensors.max()
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
-    state = None if trial is None else _tried.get(trial)
-    if state is None:
-        state = jax.eval_shape(first).kept
-    if trial is not None:
+    if trial is None:
+        return measurements, jax.eval_shape(first).kept
+    if trial not in _tried:
         if len(_tried) >= 1000:
             _tried.clear()
-        _tried[trial] = state
-    return measurements, state
+        _tried[trial] = jax.eval_shape(first).kept
+    return measurements, _tried[trial]
 
 
 _tried: dict[Any, Any] = {}
