@@ -37,7 +37,12 @@ def advance(
     if to is not None:
         return Arrival(updated, updated, info)
     present = jnp.any(measurement.mask)
-    kept = jax.tree.map(lambda new, old: jnp.where(present, new, old), updated, state)
+
+    def kept(new: Array, predicted: Array, old: Array) -> Array:
+        # What predicting leaves alone, updating with nothing leaves alone too.
+        return new if predicted is old else jnp.where(present, new, old)
+
+    kept = jax.tree.map(kept, updated, moved, state)
     return Arrival(kept, updated, info)
 
 

@@ -69,7 +69,13 @@ def update(
 
 
 def update_from_afar(
-    mean: Array, packed: Array, difference: Array, cross: Array, spread: Array, R: Array, mask: Array
+    mean: Array,
+    packed: Array,
+    difference: Array,
+    cross: Array,
+    spread: Array,
+    R: Array,
+    mask: Array,
 ) -> tuple[Array, Array, Innovation]:
     """`update` by a measurement of something else: `cross` (m, n) is its covariance with the state,
     `spread` (m, m) its own without noise."""
@@ -77,7 +83,7 @@ def update_from_afar(
     weights = cholesky.solved(innovation.cov, innovation.cross)
     mean = _moved(mean, weights, innovation.value)
     half = _reduced(packed, innovation.cross, weights)
-    seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask, spread, 0), weights)
+    seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask[None, :], spread, 0), weights)
     return mean, _joseph(half, seen, mask_cov(R, mask), weights), innovation
 
 

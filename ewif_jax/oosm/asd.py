@@ -21,9 +21,9 @@ from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 class Kept(NamedTuple):
     """Measurements by time, oldest first, L of them with the prior or what has replaced it.
 
-    time (L,); mean (L, n) and cov (L, packed) given all until then; F (L, n, n) from the one
-    before; H (L, m, n) and R (L, m, m); gain K (L, n, m), weight S^-1 (L, m, m) and pull S^-1 nu
-    (L, m). An absent component has zero H and K, and variance 1.
+    time (L,); mean (L, n) and cov (L, packed) given all until then; F (L, n, n) to the next (the
+    last one unused); H (L, m, n) and R (L, m, m); gain K (L, n, m), weight S^-1 (L, m, m) and pull
+    S^-1 nu (L, m). An absent component has zero H and K, and variance 1.
     """
 
     time: Array
@@ -124,12 +124,12 @@ def asd(model: Model, lag: int) -> Estimator:
         place = jnp.sum(state.kept.time <= measurement.time)
         known = place > 0
         usable = known & present
-        mean, cov, F, split = _split(model, params, state, measurement.time, place, usable)
-        later = jnp.arange(count) >= place
+        mean, cov, before, after = _split(model, params, state, measurement.time, place)
+        first = jnp.arange(count) == place
 
         at = mean
         if model.linear is None:
-            at = mean + symmetric.times(cov, _force(split.kept, later))
+            at = mean + symmetric.times(cov, _force(state.kept, first, after))
         predicted, H, R = sight(model, params, at, measurement.sensor, measurement.time)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
@@ -139,8 +139,10 @@ def asd(model: Model, lag: int) -> Estimator:
         difference = jnp.where(mask, difference + matvec(H, at - mean), 0)
 
         cross = symmetric.rows(H, cov).T
-        (D, U, nu), passed = _passed(split.kept, later, cross, matmul(H, cross), difference)
-        D = matmul(split.F, D)
+        entry = matmul(after, cross)
+        passed = _passed(state.kept, first, entry, matmul(H, cross), difference)
+        D = matmul(state.F, passed.D[-1]) + jnp.where(place == count, entry, 0)
+        U, nu = passed.U[-1], passed.nu[-1]
         whole = gaussian.innovate(nu, D.T, U + R, mask)
         info = Info(
             whole.value,
@@ -150,14 +152,18 @@ def asd(model: Model, lag: int) -> Estimator:
             verdict(late, present, Status.LATE_USED, good),
         )
         if state.share is not None:
-            R = R + _excess(state.share) * jnp.where(mask[:, None] & mask, whole.cov, 0)
+            R = R + _excess(state.share) * jnp.where(mask[:, None] & mask[None, :], whole.cov, 0)
         now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask)[:2]
         mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
         weight, pull, gain = _solved(innovation)
-        new = Kept(measurement.time, mean, cov, F, H, R, gain, weight, pull)
-        kept = _with(new, split.kept, passed, R, place, usable)
+        new = Kept(measurement.time, mean, cov, after, H, R, gain, weight, pull)
         mean, cov = choose(late, now, (mean, cov))
-        updated = split._replace(mean=mean, cov=cov, kept=kept)
+        updated = state._replace(
+            mean=mean,
+            cov=cov,
+            F=jnp.where(usable & (place == count), after, state.F),
+            kept=_with(new, before, state.kept, passed, R, jnp.where(usable, place, 0)),
+        )
         if model.linear is None:
             updated = choose(good, updated, state)
         return updated, too_late(info, ~known)
@@ -170,48 +176,49 @@ def asd(model: Model, lag: int) -> Estimator:
 
 
 def _split(
-    model: Model, params: Any, state: WindowState, time: Array, place: Array, usable: Array
-) -> tuple[Array, Array, Array, WindowState]:
-    """The filter's estimate at `time` with what is kept until then (mean, cov) and F (n, n) from
-    the newest of that; and the state, the interval around `time` beginning there if `usable`."""
+    model: Model, params: Any, state: WindowState, time: Array, place: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The filter's estimate at `time` with what is kept until then, mean (n,) and cov (packed), F
+    (n, n) to there from the newest of that, and from there to what comes next."""
     kept, count = state.kept, state.kept.time.shape[0]
     index = jnp.arange(count)
-    before, after = index == jnp.maximum(place - 1, 0), index == place
-    start, mean, cov = (slots.picked(x, before) for x in kept[:3])
-    end = jnp.where(place < count, slots.picked(kept.time, after), state.time)
+    here = index == jnp.maximum(place - 1, 0)
+    start, mean, cov = (slots.picked(x, here) for x in kept[:3])
+    end = jnp.where(place < count, slots.picked(kept.time, index == place), state.time)
     time = jnp.clip(time, start, state.time)
     mean, F, Q = flow(model, params, mean, start, time)
     cov = symmetric.congruence(F, cov) + symmetric.pack(Q)
-    there = choose(time < state.time, (mean, cov, F), (state.mean, state.cov, state.F))
-    _, onward, _ = flow(model, params, there[0], time, end)
-    into = (after & usable)[:, None, None]
-    kept = kept._replace(F=jnp.where(into, onward[None], kept.F))
-    F_now = jnp.where(usable & (place == count), onward, state.F)
-    return *there, state._replace(F=F_now, kept=kept)
+    mean, cov, F = choose(
+        time < state.time, (mean, cov, F), (state.mean, state.cov, state.F)
+    )  # in sequence exactly what the filter has
+    return mean, cov, F, flow(model, params, mean, time, end)[1]
 
 
-def _force(kept: Kept, later: Array) -> Array:
-    """The pull (n,) of the `later` (L,) measurements on the state before them: its estimate moves
-    by P times this."""
-    return _drawn(kept.F, kept.H, kept.gain, kept.pull, later)
+def _force(kept: Kept, first: Array, F: Array) -> Array:
+    """The pull (n,) of the measurements from `first` (L,) on, F after it, on a state before them,
+    whose estimate moves by P times this."""
+    return matvec(F.T, _pulled(first, kept.H, kept.gain, kept.pull, kept.F))
 
 
 @kernel
-def _drawn(F: Array, H: Array, gain: Array, pull: Array, later: Array) -> Array:
-    batch = jnp.broadcast_shapes(*(x.shape[x.ndim - later.ndim + 1 :] for x in (F, H, gain, pull)))
+def _pulled(first: Array, *kept: Array) -> Array:
+    batch = first.ndim - 1
+    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in (first, *kept)))
+    later = jnp.cumsum(first, 0) > 0
 
     def back(force: Array, one: tuple[Array, ...]) -> tuple[Array, None]:
-        F, H, gain, pull, later = one
-        rest = pull - _product(jnp.swapaxes(gain, 0, 1), force)
-        before = _product(jnp.swapaxes(F, 0, 1), force + _product(jnp.swapaxes(H, 0, 1), rest))
-        return jnp.where(later[None], before, force), None
+        later, H, gain, pull, F = one
+        force_then = _product(_turned(F), force)
+        rest = pull - _product(_turned(gain), force_then)
+        return jnp.where(later[None], force_then + _product(_turned(H), rest), force), None
 
-    return lax.scan(back, jnp.zeros((F.shape[1], *batch), F.dtype), (F, H, gain, pull, later), reverse=True)[0]
+    start = jnp.zeros((kept[0].shape[2], *runs), kept[0].dtype)
+    return lax.scan(back, start, (later, *kept), reverse=True)[0]
 
 
 class Passed(NamedTuple):
-    """D (L, n, m), U (L, m, m) and nu (L, m) behind each kept measurement, and G (L, m, m); D and G
-    are zero for those that are not later."""
+    """Of a late measurement behind each kept one: D (L, n, m), U (L, m, m), nu (L, m) and
+    G (L, m, m); D and G are zero for those that are earlier."""
 
     D: Array
     U: Array
@@ -219,37 +226,32 @@ class Passed(NamedTuple):
     G: Array
 
 
-def _passed(kept: Kept, later: Array, D: Array, U: Array, nu: Array) -> tuple[Any, Passed]:
-    """D (n, m), U (m, m), nu (m,) of a measurement behind all that are kept, and behind each."""
-    *last, D, U, nu, G = _pass(*kept[3:], later, D, U, nu)
-    return last, Passed(D, U, nu, G)
+def _passed(kept: Kept, first: Array, D: Array, U: Array, nu: Array) -> Passed:
+    """Passes D (n, m), U (m, m), nu (m,) along the kept ones, beginning with the `first` (L,)."""
+    return Passed(*_pass(first, *kept[3:], D, U, nu))
 
 
 @kernel
-def _pass(
-    F: Array, H: Array, R: Array, gain: Array, weight: Array, pull: Array, later: Array,
-    D: Array, U: Array, nu: Array,
-) -> tuple[Array, ...]:
+def _pass(first: Array, *arrays: Array) -> tuple[Array, ...]:
+    (F, H, R, gain, weight, pull), (entry, U, nu) = arrays[:6], arrays[6:]
     batch = nu.ndim - 1
+    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in (first, *arrays)))
+    entry = jnp.broadcast_to(entry, entry.shape[:2] + runs)
 
-    def behind(carry, one):
-        D, U, nu = carry
-        F, H, R, gain, weight, pull, later = one
-        moved = stage(_product, F, D, batch=batch)
-        g = stage(_product, H, moved, batch=batch)
-        G = stage(_product, weight, g, batch=batch)
-        half = stage(_less, moved, gain, g, batch=batch)
-        rounded = stage(_rest, R, G, H, half, batch=batch)
-        new = stage(_joseph, half, gain, U, nu, g, G, rounded, pull, batch=batch)
-        carry = tuple(jnp.where(later, a, b) for a, b in zip(new, carry, strict=True))
-        D, U, nu = carry
-        return carry, (jnp.where(later, D, 0), U, nu, jnp.where(later, G, 0))
+    def behind(D: Array, one: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        first, F, H, gain, share = one
+        g = stage(_seen, H, first, entry, D, batch=batch)
+        half = stage(_less, first, entry, D, gain, g, batch=batch)
+        rounded = stage(_rounded, share, g, H, half, batch=batch)
+        D = stage(_more, half, gain, rounded, batch=batch)
+        return stage(_product, F, D, batch=batch), (D, g, rounded)
 
-    everything = (F, H, R, gain, weight, pull, later)
-    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch:] for x in (*everything, D, U, nu)))
-    start = tuple(jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs) for x in (D, U, nu))
-    last, each = lax.scan(behind, start, everything)
-    return *last, *each
+    share = _products(R, weight)
+    D, g, rounded = lax.scan(behind, jnp.zeros_like(entry), (first, F, H, gain, share))[1]
+    G = _products(weight, g)
+    taken = _products(jnp.swapaxes(G, 1, 2), g - rounded)
+    told = total(g[:, k] * pull[:, k, None] for k in range(g.shape[1]))
+    return D, U[None] - jnp.cumsum(taken, 0), nu[None] - jnp.cumsum(told, 0), G
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -259,54 +261,77 @@ def _product(a: Array, b: Array) -> Array:
     return total(a[:, k, None] * b[None, k] for k in range(b.shape[0]))
 
 
-def _less(a: Array, b: Array, c: Array) -> Array:
-    return a - _product(b, c)
+def _products(a: Array, b: Array) -> Array:
+    """a b for matrices (L, ., .)."""
+    return total(a[:, :, k, None] * b[:, None, k] for k in range(b.shape[1]))
 
 
-def _rest(R: Array, G: Array, H: Array, half: Array) -> Array:
-    """R G - H half: zero but for what `half` was rounded by."""
-    return _product(R, G) - _product(H, half)
+def _turned(a: Array) -> Array:
+    return jnp.swapaxes(a, 0, 1)
 
 
-def _joseph(half, gain, U, nu, g, G, rounded, pull) -> tuple[Array, Array, Array]:
-    D = half + _product(gain, rounded)
-    back = jnp.swapaxes(G, 0, 1)
-    U = U - _product(back, g - rounded)
-    nu = nu - _product(jnp.swapaxes(g, 0, 1), pull)
-    return D, (U + jnp.swapaxes(U, 0, 1)) / 2, nu
+def _seen(H: Array, first: Array, entry: Array, D: Array) -> Array:
+    return _product(H, jnp.where(first[None, None], entry, D))
 
 
-def _with(new: Kept, kept: Kept, passed: Passed, R: Array, place: Array, usable: Array) -> Kept:
-    """The kept measurements, those after `place` corrected for `new`, which is inserted before
-    them if `usable`; the oldest leaves."""
+def _less(first: Array, entry: Array, D: Array, gain: Array, g: Array) -> Array:
+    return jnp.where(first[None, None], entry, D) - _product(gain, g)
+
+
+def _rounded(share: Array, g: Array, H: Array, half: Array) -> Array:
+    """R S^-1 g - H half: zero but for what `half` was rounded by."""
+    return _product(share, g) - _product(H, half)
+
+
+def _more(half: Array, gain: Array, rounded: Array) -> Array:
+    return half + _product(gain, rounded)
+
+
+def _with(new: Kept, before: Array, kept: Kept, passed: Passed, R: Array, place: Array) -> Kept:
+    """The kept measurements: `new`, to which F is `before`, in its place (0: left out), those after
+    it corrected, the oldest gone."""
     D, U, nu, G = passed
-    right = jnp.concatenate([jnp.swapaxes(D, 1, 2), jnp.swapaxes(G, 1, 2), nu[:, :, None]], 2)
-    ratio = jax.vmap(cholesky.solved)(U + R[None], right)
+    eye = jnp.broadcast_to(jnp.eye(R.shape[0], dtype=R.dtype), U.shape)
+    weight = jax.vmap(cholesky.solved)(U + R[None], eye)
     index = jnp.arange(U.shape[0]) + 1
-    return Kept(*_changed(index < jnp.where(usable, place, 0), (index == place) & usable, D, G, ratio, *kept, *new))
+    flags = index < place, index == place, index + 1 == place
+    return Kept(*_changed(*flags, before, D, G, nu, weight, *kept, *new))
 
 
 @kernel
-def _changed(older: Array, here: Array, D: Array, G: Array, ratio: Array, *tables: Array) -> tuple[Array, ...]:
+def _changed(
+    older: Array,
+    here: Array,
+    last: Array,
+    before: Array,
+    D: Array,
+    G: Array,
+    nu: Array,
+    weight: Array,
+    *tables: Array,
+) -> tuple[Array, ...]:
     kept, new = Kept(*tables[:9]), Kept(*tables[9:])
-    n, m = D.shape[1:3]
-    gain, innovations, nu = ratio[:, :, :n], ratio[:, :, n : n + m], ratio[:, :, n + m]
-    rows, cols = np.triu_indices(n)
+    batch, m = nu.ndim - 2, nu.shape[1]
+    gain = stage(_products, D, weight, batch=batch)
+    share = stage(_products, G, weight, batch=batch)
+    rows, cols = np.triu_indices(D.shape[1])
     corrected = kept._replace(
-        mean=kept.mean + total(D[:, :, j] * nu[:, j, None] for j in range(m)),
-        cov=kept.cov - total(D[:, rows, j] * gain[:, j, cols] for j in range(m)),
-        gain=kept.gain - total(gain[:, j, :, None] * G[:, None, :, j] for j in range(m)),
-        weight=kept.weight + total(G[:, :, None, j] * innovations[:, j, None] for j in range(m)),
-        pull=kept.pull - total(G[:, :, j] * nu[:, j, None] for j in range(m)),
+        mean=kept.mean + total(gain[:, :, j] * nu[:, None, j] for j in range(m)),
+        cov=kept.cov - total(D[:, rows, j] * gain[:, cols, j] for j in range(m)),
+        gain=kept.gain - _products(gain, jnp.swapaxes(G, 1, 2)),
+        weight=kept.weight + _products(share, jnp.swapaxes(G, 1, 2)),
+        pull=kept.pull - total(share[:, :, j] * nu[:, None, j] for j in range(m)),
     )
 
-    def moved(table: Array, corrected: Array, new: Array) -> Array:
-        shape = (here.shape[0], *(1,) * (table.ndim - here.ndim), *here.shape[1:])
-        shifted = jnp.concatenate([table[1:], table[-1:]])
-        kept = jnp.where(here.reshape(shape), new[None], corrected)
-        return jnp.where(older.reshape(shape), shifted, kept)
+    def wide(flags: Array, like: Array) -> Array:
+        return flags.reshape(flags.shape[0], *(1,) * (like.ndim - flags.ndim), *flags.shape[1:])
 
-    return tuple(map(moved, kept, corrected, new))
+    def moved(table: Array, corrected: Array, new: Array) -> Array:
+        later = jnp.where(wide(here, table), new[None], corrected)
+        return jnp.where(wide(older, table), jnp.concatenate([table[1:], table[-1:]]), later)
+
+    result = Kept(*map(moved, kept, corrected, new))
+    return tuple(result._replace(F=jnp.where(wide(last, kept.F), before[None], result.F)))
 
 
 def _solved(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:

@@ -3,9 +3,10 @@
 import jax
 import numpy as np
 import pytest
-from late_streams import exact, problem, stream
+from late_streams import chain, exact, problem, stream
 
 import ewif_jax as ej
+from ewif_jax.models import position_sensor, random_walk
 from ewif_jax.oosm.asd import asd
 from ewif_jax.oosm.replay import replay
 
@@ -32,6 +33,52 @@ def test_asd_and_replay_are_exact(n, m, rank):
         np.testing.assert_array_equal(
             trace.info.status, np.where(late, ej.Status.LATE_USED, ej.Status.USED)
         )
+
+
+@pytest.mark.parametrize("affine", [False, True], ids=["orthogonal", "affine"])
+@pytest.mark.parametrize(("n", "seed"), [(3, 0), (3, 1), (4, 2), (4, 3)])
+def test_asd_is_exact_where_one_noise_drives_a_chain(n, seed, affine):
+    """Integrators in axes that mix them, at intervals from 0.02 to 1: the smallest variance of the
+    process noise of an interval is far below the rounding of its largest."""
+    given = chain(seed, n, affine)
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(np.exp(rng.uniform(np.log(0.02), 0.0, 14)))
+    times[7] = times[6]
+    times = times[np.argsort(times + rng.exponential(2.0, 14))]
+    data = stream(given, rng, times)
+    assert (np.diff(times) < 0).sum() >= 3
+    trace = ej.run(asd(given.model, 14), None, data, prior=given.prior, t0=0.0)
+    means, covs = exact(given, data)
+    np.testing.assert_allclose(trace.mean, means, atol=1e-8)
+    np.testing.assert_allclose(trace.cov, covs, atol=1e-8)
+
+
+def test_asd_is_exact_without_process_noise():
+    given = problem(8, 4, 2, 0)
+    rng = np.random.default_rng(8)
+    data = stream(given, rng, shuffled(rng, 14))
+    means, covs = exact(given, data)
+    trace = ej.run(asd(given.model, 14), None, data, prior=given.prior, t0=0.0)
+    np.testing.assert_allclose(trace.mean, means, atol=1e-8)
+    np.testing.assert_allclose(trace.cov, covs, atol=1e-8)
+
+
+def test_single_precision_survives_a_prior_that_knows_nothing():
+    """Late measurements older than the first, whose variance is 1e-10 of the prior's."""
+    model = random_walk(sensors=position_sensor(0.01), q=0.1)
+    times = np.array([1.0, 0.5, 0.2, 1.5, 0.7, 2.0, 1.2])
+    values = np.random.default_rng(9).normal(size=7)
+
+    def trace(method, dtype):
+        prior = ej.Gaussian(np.zeros(1, dtype), 1e8 * np.eye(1, dtype=dtype))
+        data = ej.stream(times.astype(dtype), values.astype(dtype))
+        return ej.run(method, None, data, prior=prior, t0=dtype(0.0))
+
+    single = trace(asd(model, 7), np.float32)
+    double = trace(replay(ej.kalman(model), 7), np.float64)
+    spread = np.sqrt(np.diagonal(double.cov, axis1=1, axis2=2))
+    assert np.abs((single.mean - double.mean) / spread).max() < 1e-3
+    np.testing.assert_allclose(single.cov, double.cov, rtol=1e-3)
 
 
 def test_asd_is_exact_for_all_that_it_accepts():
