@@ -37,12 +37,7 @@ def advance(
     if to is not None:
         return Arrival(updated, updated, info)
     present = jnp.any(measurement.mask)
-
-    def kept(new: Array, predicted: Array, old: Array) -> Array:
-        # What predicting leaves alone, updating with nothing leaves alone too.
-        return new if predicted is old else jnp.where(present, new, old)
-
-    kept = jax.tree.map(kept, updated, moved, state)
+    kept = jax.tree.map(lambda new, old: jnp.where(present, new, old), updated, state)
     return Arrival(kept, updated, info)
 
 

@@ -66,7 +66,7 @@ def asd(model: Model, lag: int) -> Estimator:
         D^- = F_i D, \quad g = H_i D^-, \quad G = S_i^{-1} g, \quad D = D^- - K_i g, \quad
         U \mathrel{-}= g' G, \quad \nu \mathrel{-}= g' S_i^{-1} \nu_i
 
-    (D and U in Joseph's form). What is stored of that measurement then becomes what it would be had
+    (D in Joseph's form). What is stored of that measurement then becomes what it would be had
     z been there: with :math:`S = U + R`,
 
     .. math::

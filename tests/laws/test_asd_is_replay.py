@@ -6,7 +6,6 @@ import pytest
 from late_streams import chain, exact, problem, stream
 
 import ewif_jax as ej
-from ewif_jax.models import position_sensor, random_walk
 from ewif_jax.oosm.asd import asd
 from ewif_jax.oosm.replay import replay
 
@@ -61,24 +60,6 @@ def test_asd_is_exact_without_process_noise():
     trace = ej.run(asd(given.model, 14), None, data, prior=given.prior, t0=0.0)
     np.testing.assert_allclose(trace.mean, means, atol=1e-8)
     np.testing.assert_allclose(trace.cov, covs, atol=1e-8)
-
-
-def test_single_precision_survives_a_prior_that_knows_nothing():
-    """Late measurements older than the first, whose variance is 1e-10 of the prior's."""
-    model = random_walk(sensors=position_sensor(0.01), q=0.1)
-    times = np.array([1.0, 0.5, 0.2, 1.5, 0.7, 2.0, 1.2])
-    values = np.random.default_rng(9).normal(size=7)
-
-    def trace(method, dtype):
-        prior = ej.Gaussian(np.zeros(1, dtype), 1e8 * np.eye(1, dtype=dtype))
-        data = ej.stream(times.astype(dtype), values.astype(dtype))
-        return ej.run(method, None, data, prior=prior, t0=dtype(0.0))
-
-    single = trace(asd(model, 7), np.float32)
-    double = trace(replay(ej.kalman(model), 7), np.float64)
-    spread = np.sqrt(np.diagonal(double.cov, axis1=1, axis2=2))
-    assert np.abs((single.mean - double.mean) / spread).max() < 1e-3
-    np.testing.assert_allclose(single.cov, double.cov, rtol=1e-3)
 
 
 def test_asd_is_exact_for_all_that_it_accepts():
