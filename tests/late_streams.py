@@ -51,7 +51,21 @@ def problem(seed: int, n: int, m: int = 1, noise_rank: int | None = None) -> Pro
     basis = scipy.linalg.orth(rng.normal(size=(n, n)))
     A = basis @ np.triu(rng.normal(size=(n, n)), 1) @ basis.T
     root = rng.normal(size=(n, n if noise_rank is None else noise_rank))
-    D = 0.3 * root @ root.T
+    return observed(rng, A, 0.3 * root @ root.T, m)
+
+
+def chain(seed: int, n: int, affine: bool) -> Problem:
+    """n integrators in a row, the last one driven by noise, in orthogonal or affine axes."""
+    rng = np.random.default_rng(seed)
+    mix = rng.normal(size=(n, n))
+    mix = mix + 2 * np.eye(n) if affine else scipy.linalg.orth(mix)
+    A = mix @ np.eye(n, k=1) @ np.linalg.inv(mix)
+    return observed(rng, A, 0.3 * np.outer(mix[:, -1], mix[:, -1]), 1)
+
+
+def observed(rng: np.random.Generator, A: np.ndarray, D: np.ndarray, m: int) -> Problem:
+    """Random input, sensors and prior for the motion dx = A x dt + noise of density D."""
+    n = len(A)
     push = rng.normal(size=n)
     H = rng.normal(size=(2, m, n))
     L = rng.normal(size=(2, m, m))

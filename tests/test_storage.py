@@ -13,6 +13,8 @@ N, LAG = 4, 10
 PACKED = N * (N + 1) // 2
 GAUSSIAN = 1 + N + PACKED
 """time, mean, packed covariance"""
+SEEN = 2 * N * 2 + 2 * 2 * 2 + 2
+"""H and K, R and S^-1, S^-1 nu"""
 
 
 @pytest.mark.parametrize(
@@ -23,7 +25,7 @@ GAUSSIAN = 1 + N + PACKED
         (ej.a1(MODEL), 2 * GAUSSIAN),
         (ej.al1(MODEL, LAG), (1 + LAG) * GAUSSIAN),
         (ej.bl1(MODEL, LAG), (1 + LAG) * GAUSSIAN),
-        (ej.asd(MODEL, LAG), 1 + (1 + LAG) * (1 + N) + ((1 + LAG) * N) ** 2),
+        (ej.asd(MODEL, LAG), GAUSSIAN + N * N + (1 + LAG) * (GAUSSIAN + N * N + SEEN)),
         (ej.replay(ej.extended(MODEL), LAG, width=2), 2 + 2 * GAUSSIAN + LAG * (1 + 2)),
     ],
 )

@@ -14,7 +14,6 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.forms import information
 from ewif_jax.forms.information import InformationState
-from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.types import Estimator, Info, Measurement
 
 
@@ -34,31 +33,16 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
         if hasattr(state, "shares"):  # stored with the measurement, and used whenever it is
             marked = state._replace(shares=state.shares.at[-1].set(share))
             return estimator.update(params, marked, measurement)
-        if hasattr(state, "means"):
-            updated, info = _of_several_times(estimator, params, state, measurement, share)
+        if hasattr(state, "share"):  # does it itself, with what it keeps of the measurement
+            marked = state._replace(share=share)
+            updated, info = estimator.update(params, marked, measurement)
+            updated = updated._replace(share=state.share)
         else:
             updated, info = estimator.update(params, state, measurement)
             updated = _mixed(state, updated, share)
         return updated, info._replace(log_likelihood=share * info.log_likelihood)
 
     return estimator._replace(update=update)
-
-
-def _of_several_times(
-    estimator: Estimator, params: Any, state: Any, measurement: Measurement, share: Array
-) -> tuple[Any, Info]:
-    """The joint state with `share` of the effect of the measurement, not of making room for its
-    time. The gain is the derivative of the new means."""
-
-    def means(value: Array) -> tuple[Array, tuple[Any, Info]]:
-        updated, info = estimator.update(params, state, measurement._replace(value=value))
-        return updated.means.reshape(-1), (updated, info)
-
-    gain, (updated, info) = jax.jacfwd(means, has_aux=True)(measurement.value)
-    back = matvec(gain, info.innovation).reshape(updated.means.shape)
-    spread = matmul(matmul(gain, info.innovation_cov), gain.T)
-    means_then = updated.means - (1 - share) * back
-    return updated._replace(means=means_then, cov=updated.cov + (1 - share) * spread), info
 
 
 def _mixed(old: Any, new: Any, share: Array) -> Any:

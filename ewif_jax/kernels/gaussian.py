@@ -90,6 +90,25 @@ def _expected(where: Pattern | None) -> Callable[[Array, Array, Array], Array]:
     return expected
 
 
+def update_from_afar(
+    mean: Array,
+    packed: Array,
+    difference: Array,
+    cross: Array,
+    spread: Array,
+    R: Array,
+    mask: Array,
+) -> tuple[Array, Array, Innovation]:
+    """`update` by a measurement of something else: `cross` (m, n) is its covariance with the state,
+    `spread` (m, m) its own without noise."""
+    innovation = innovate(difference, cross, spread + R, mask)
+    weights = cholesky.solved(innovation.cov, innovation.cross)
+    mean = _moved(mean, weights, innovation.value)
+    half = _reduced(packed, innovation.cross, weights)
+    seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask[None, :], spread, 0), weights)
+    return mean, _joseph(half, seen, mask_cov(R, mask), weights), innovation
+
+
 @kernel
 def _moved(mean: Array, weights: Array, value: Array) -> Array:
     """mean + K value, with K' = weights."""

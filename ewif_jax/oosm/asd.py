@@ -1,63 +1,69 @@
-"""The accumulated state density: the joint Gaussian of now and the last update times."""
+"""Exact use of late measurements at constant cost: what the last ones did is kept and corrected."""
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose, verdict
 from ewif_jax.forms.innovations import Compared, sound
-from ewif_jax.kernels import gaussian, retrodiction, slots, symmetric
-from ewif_jax.kernels.batched import kernel, total
+from ewif_jax.kernels import cholesky, gaussian, slots, symmetric, window
 from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
-class JointState(NamedTuple):
-    """time (); used (): whether this time has taken a measurement; newest first, times (L,),
-    means (L, n) and cov (L n, L n): the joint covariance."""
+class WindowState(NamedTuple):
+    """time (), mean (n,), cov (packed); F (n, n) from the newest kept measurement to now; kept;
+    share (): how much of the next measurement is used, or None where that is all."""
 
     time: Array
-    used: Array
-    times: Array
-    means: Array
+    mean: Array
     cov: Array
+    F: Array
+    kept: window.Kept
+    share: Array | None = None
 
 
 def asd(model: Model, lag: int) -> Estimator:
-    r"""The filter of the joint density of the states at the last `lag` + 1 distinct times.
+    r"""The filter of the joint density of the states at the last `lag` measurements and now.
 
     .. math::
         p(x_k, x_{k-1}, \ldots, x_{k-L} \mid Z)
 
-    (Koch & Govaers 2011; a fixed-lag augmented state). A measurement of any of these times is one
-    Kalman update of the joint state. One that lies between two of them, a < d < c, brings the
-    state of its own time into the joint, which is
+    (Koch & Govaers 2011, the accumulated state density; a fixed-lag augmented state). It is stored
+    as the filter leaves it, by time: for every measurement i the estimate until then,
+    :math:`F_i, H_i, R_i, K_i, S_i^{-1}` and :math:`S_i^{-1} \nu_i`. A late measurement
+    :math:`z = u + v,\; u = H x_d` starts from the estimate until its time. What u has in common
+    with the states that follow, :math:`D = \mathrm{cov}(x, u)`, with itself,
+    :math:`U = \mathrm{cov}(u)`, and its innovation pass each later measurement,
 
     .. math::
-        x_d = F_{da} x_a + b_{da} + G (x_c - F_{ca} x_a - b_{ca}) + e, \quad
-        G = Q_{da} F_{cd}' (F_{cd} Q_{da} F_{cd}' + Q_{cd})^{-1}, \quad
-        \mathrm{cov}(e) = Q_{da} - G F_{cd} Q_{da}
+        D^- = F_i D, \quad g = H_i D^-, \quad G = S_i^{-1} g, \quad D = D^- - K_i g, \quad
+        U \mathrel{-}= g' G, \quad \nu \mathrel{-}= g' S_i^{-1} \nu_i
 
-    because nothing else is known about the inside of an interval; the oldest state leaves. So any
-    number of late measurements in any order is used exactly, at a cost that does not depend on the
-    delay: of order (lag n)^2, nothing is filtered again. A nonlinear model is linearised.
+    (D in Joseph's form). What is stored of that measurement then becomes what it would be had
+    z been there: with :math:`S = U + R`,
+
+    .. math::
+        \hat x_i \mathrel{+}= D S^{-1} \nu, \quad P_i \mathrel{-}= D S^{-1} D', \quad
+        K_i \mathrel{-}= D S^{-1} G', \quad S_i^{-1} \mathrel{+}= G S^{-1} G', \quad
+        S_i^{-1} \nu_i \mathrel{-}= G S^{-1} \nu
+
+    So any number of late measurements in any order is used exactly, at a cost of order L n^2 m that
+    does not depend on the delay; nothing is filtered again, and no process noise is inverted. A
+    nonlinear model is linearised: motion where the filter was, a late measurement at the estimate
+    of its own time given all until then.
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. Motion back
             in time is not needed.
-        lag: how many past times are kept, >= 1. A measurement older than all of them, or than t0,
-            is `TOO_LATE`.
-
-    The joint covariance resolves what two neighbouring states do not have in common only down to
-    the rounding of what they have. Where noise drives just the end of a chain of three or more
-    integrators, its smallest variance is far below that: in the axes of the chain about 1e-7 is
-    left of float64 for intervals of 0.01 among ones of 1, and in axes that mix the chain errors of
-    1e-12 to 3e-2 of a unit were seen (3 and 4 states, one noise, intervals from 0.02 to 1).
-    `replay` does not have this limit.
+        lag: how many measurements are kept, >= 1. One older than the newest that has left, or than
+            t0, is `TOO_LATE`.
 
     Reduces to: `kalman` (or `extended`) in sequence; `replay` of it for a linear model.
 
@@ -67,161 +73,114 @@ def asd(model: Model, lag: int) -> Estimator:
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     count = checks.whole("lag", lag, 1) + 1
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> JointState:
-        del params, key
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> WindowState:
+        del key
         prior = checks.needs_prior(prior, "asd")
         checks.prior(prior)
         mean = jnp.asarray(prior.mean)
-        cov = jnp.asarray(prior.cov, mean.dtype)
-        time = jnp.asarray(t0, mean.dtype)
-        times, means = jnp.stack([time] * count), jnp.stack([mean] * count)
-        return JointState(time, jnp.asarray(False), times, means, jnp.tile(cov, (count, count)))
+        cov = symmetric.pack(jnp.asarray(prior.cov, mean.dtype))
+        time, still = jnp.asarray(t0, mean.dtype), jnp.eye(mean.shape[0], dtype=mean.dtype)
+        noise = jax.eval_shape(lambda: jnp.asarray(model.measurement_cov(params, np.int32(0), t0)))
+        one = jnp.eye(noise.shape[0], dtype=mean.dtype)
+        none = jnp.zeros((noise.shape[0], mean.shape[0]), mean.dtype)
+        first = window.Kept(time, mean, cov, still, none, one, none.T, one, none[:, 0])
+        kept = jax.tree.map(lambda leaf: jnp.stack([leaf] * count), first)
+        return WindowState(time, mean, cov, still, kept)
 
-    def predict(params: Any, state: JointState, time: Array) -> JointState:
+    def predict(params: Any, state: WindowState, time: Array) -> WindowState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.means[0], state.time, ahead)
-        n = mean.shape[0]
-        row = matmul(F, state.cov[:n])
-        own = matmul(row[:, :n], F.T) + Q
-        left = ahead > state.time
-        first = jnp.arange(count) == 0
-        moved = _placed(state, first, ~first & left & state.used, ahead, mean, row, own)
+        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+        checks.shape("F", F, (state.mean.shape[0],) * 2)
+        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
         known = time >= state.time
-        return moved._replace(
-            time=time,
-            used=state.used & ~left,
-            means=jnp.where(known, moved.means, jnp.nan),
-            cov=jnp.where(known, moved.cov, jnp.nan),
-        )
+        mean, cov = jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan)
+        return state._replace(time=time, mean=mean, cov=cov, F=matmul(F, state.F))
 
-    def update(params: Any, state: JointState, measurement: Measurement) -> tuple[JointState, Info]:
-        newer = jnp.sum(state.times > measurement.time)
-        known = newer < count
-        present = jnp.any(measurement.mask)
+    def update(
+        params: Any, state: WindowState, measurement: Measurement
+    ) -> tuple[WindowState, Info]:
+        late, present = measurement.time < state.time, jnp.any(measurement.mask)
+        place = jnp.sum(state.kept.time <= measurement.time)
+        known = place > 0
         usable = known & present
-        mask = measurement.mask & usable
-        at = jnp.arange(count) == jnp.where(known, newer, 0)
-        joint = _with_time(model, params, state, at, measurement.time, usable)
-        mean, row = slots.picked(joint.means, at), _row(joint.cov, at)
-        predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
+        mean, cov, before, after = _split(model, params, state, measurement.time, place)
+        first = jnp.arange(count) == place
+
+        at = mean
+        if model.linear is None:
+            at = mean + symmetric.times(cov, window.force(state.kept, first, after))
+        predicted, H, R = sight(model, params, at, measurement.sensor, measurement.time)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
-        by_slot = row.T.reshape(count, -1, row.shape[0])
-        cov = symmetric.pack(slots.picked(by_slot, at))
-        (difference, H, R, mask), good = sound(model, cov, Compared(difference, H, R, mask))
-        cross = matmul(H, row)
-        own = slots.picked(cross.T.reshape(count, -1, H.shape[0]), at).T
-        innovation = gaussian.innovate(difference, cross, matmul(own, H.T) + R, mask)
-        weights = gaussian.gain(innovation).T
-        half = _reduced(joint.cov, innovation.cross, weights)
-        correction = matmul(gaussian.mask_cov(R, mask), weights) - matmul(H, _row(half, at))
-        shift = matvec(weights.T, innovation.value)
-        updated = joint._replace(
-            used=state.used | usable,
-            means=joint.means + shift.reshape(count, -1),
-            cov=_joseph(half, weights, correction),
-        )
-        late = measurement.time < state.time
+        seen = Compared(difference, H, R, measurement.mask & known)
+        (difference, H, R, mask), good = sound(model, cov, seen)
+        H, R = jnp.where(mask[:, None], H, 0), gaussian.mask_cov(R, mask)
+        difference = jnp.where(mask, difference + matvec(H, at - mean), 0)
+
+        cross = symmetric.rows(H, cov).T
+        entry = matmul(after, cross)
+        passed = window.passed(state.kept, first, entry, matmul(H, cross), difference)
+        D = matmul(state.F, passed.D[-1]) + jnp.where(place == count, entry, 0)
+        U, nu = passed.U[-1], passed.nu[-1]
+        whole = gaussian.innovate(nu, D.T, U + R, mask)
         info = Info(
-            innovation.value,
-            innovation.cov,
-            gaussian.log_density(innovation, mask),
+            whole.value,
+            whole.cov,
+            gaussian.log_density(whole, mask),
             state.time - measurement.time,
             verdict(late, present, Status.LATE_USED, good),
         )
-        if model.linear is None:
-            updated = choose(good, updated, state)
-        return updated, too_late(info, ~known)
+        if state.share is not None:
+            R = R + _excess(state.share) * jnp.where(mask[:, None] & mask[None, :], whole.cov, 0)
+        now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask)[:2]
+        mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
+        weight, pull, gain = _solved(innovation)
+        new = window.Kept(measurement.time, mean, cov, after, H, R, gain, weight, pull)
+        mean, cov = choose(late, now, (mean, cov))
+        updated = state._replace(
+            mean=mean,
+            cov=cov,
+            F=jnp.where(usable & (place == count), after, state.F),
+            kept=window.inserted(new, before, state.kept, passed, R, jnp.where(usable, place, 0)),
+        )
+        return choose(usable & good, updated, state), too_late(info, ~known)
 
-    def estimate(params: Any, state: JointState) -> Gaussian:
+    def estimate(params: Any, state: WindowState) -> Gaussian:
         del params
-        n = state.means.shape[1]
-        cov = state.cov[:n, :n]
-        return Gaussian(state.means[0], (cov + cov.T) / 2)
+        return Gaussian(state.mean, symmetric.unpack(state.cov))
 
     return Estimator(init, predict, update, estimate)
 
 
-def _with_time(
-    model: Model, params: Any, state: JointState, at: Array, time: Array, usable: Array
-) -> JointState:
-    """The joint with a state of `time` in the slot `at` (L,), whose present state is the last not
-    newer; unchanged unless `usable`, or where that state is of this very time."""
-    after = jnp.concatenate([at[:1] | at[1:2], at[2:], jnp.zeros(1, bool)])
-    start, end = slots.picked(state.times, at), slots.picked(state.times, after)
-    before_mean, after_mean = slots.picked(state.means, at), slots.picked(state.means, after)
-    time = jnp.clip(time, start, end)
-    there, F1, Q1 = flow(model, params, before_mean, start, time)
-    arrived, F2, Q2 = flow(model, params, there, time, end)
-    gain, left_over = retrodiction.bridge(Q1, F2, Q2)
-    rest = F1 - matmul(matmul(gain, F2), F1)
-    mean = there + matvec(gain, after_mean - arrived)
-    row = matmul(gain, _row(state.cov, after)) + matmul(rest, _row(state.cov, at))
-    by_slot = row.T.reshape(at.shape[0], -1, row.shape[0])
-    own = matmul(gain, slots.picked(by_slot, after)) + matmul(rest, slots.picked(by_slot, at))
-    push = usable & (time > start)
-    older = jnp.cumsum(at) > at
-    return _placed(state, at & push, older & push, time, mean, row, own + left_over)
+def _split(
+    model: Model, params: Any, state: WindowState, time: Array, place: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The filter's estimate at `time` with what is kept until then, mean (n,) and cov (packed), F
+    (n, n) to there from the newest of that, and from there to what comes next."""
+    kept, count = state.kept, state.kept.time.shape[0]
+    index = jnp.arange(count)
+    here = index == jnp.maximum(place - 1, 0)
+    start, mean, cov = (slots.picked(x, here) for x in kept[:3])
+    end = jnp.where(place < count, slots.picked(kept.time, index == place), state.time)
+    time = jnp.clip(time, start, state.time)
+    mean, F, Q = flow(model, params, mean, start, time)
+    cov = symmetric.congruence(F, cov) + symmetric.pack(Q)
+    mean, cov, F = choose(
+        time < state.time, (mean, cov, F), (state.mean, state.cov, state.F)
+    )  # in sequence exactly what the filter has
+    return mean, cov, F, flow(model, params, mean, time, end)[1]
 
 
-def _placed(
-    state: JointState, here: Array, older: Array, time: Array, mean: Array, row: Array, own: Array
-) -> JointState:
-    """The joint with a new state in the slot `here` (L,): mean (n,), covariances `row` (n, L n)
-    with the old slots and `own` (n, n). The slots `older` (L,) take what was one slot newer."""
-    return state._replace(
-        times=_replaced(state.times, time, here, older),
-        means=_replaced(state.means, mean, here, older),
-        cov=_inserted(state.cov, row, own, here, older),
-    )
+def _solved(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:
+    """S^-1 (m, m), S^-1 nu (m,) and K (n, m)."""
+    m = innovation.value.shape[0]
+    eye = jnp.eye(m, dtype=innovation.value.dtype)
+    right = jnp.concatenate([eye, innovation.value[:, None], innovation.cross], 1)
+    ratio = cholesky.solved(innovation.cov, right)
+    return ratio[:, :m], ratio[:, m], ratio[:, m + 1 :].T
 
 
-def _row(cov: Array, at: Array) -> Array:
-    """The rows (n, L n) of the joint covariance that belong to the slot `at` (L,)."""
-    return slots.picked(cov.reshape(at.shape[0], -1, cov.shape[1]), at)
-
-
-@kernel
-def _replaced(table: Array, new: Array, here: Array, older: Array) -> Array:
-    inner = (1,) * (table.ndim - here.ndim)
-
-    def wide(flags: Array) -> Array:
-        return flags.reshape(flags.shape[:1] + inner + flags.shape[1:])
-
-    moved = jnp.where(wide(older), jnp.concatenate([table[:1], table[:-1]]), table)
-    return jnp.where(wide(here), new[None], moved)
-
-
-@kernel
-def _inserted(cov: Array, row: Array, own: Array, here: Array, older: Array) -> Array:
-    count, n, batch = here.shape[0], own.shape[0], cov.shape[2:]
-    blocks = cov.reshape(count, n, count, n, *batch)
-    across = row.reshape(n, count, n, *row.shape[2:])
-    (here_down, older_down), (here_across, older_across) = (
-        [x[:, None, None, None] for x in (here, older)],
-        [x[None, None, :, None] for x in (here, older)],
-    )
-    blocks = jnp.where(older_down, jnp.concatenate([blocks[:1], blocks[:-1]]), blocks)
-    blocks = jnp.where(
-        older_across, jnp.concatenate([blocks[:, :, :1], blocks[:, :, :-1]], 2), blocks
-    )
-    across = jnp.where(older_across[0], jnp.concatenate([across[:, :1], across[:, :-1]], 1), across)
-    across = jnp.where(here_across[0], own[:, None], across)
-    down = jnp.moveaxis(across, (0, 1, 2), (2, 0, 1))
-    blocks = jnp.where(here_across, down[:, :, None], blocks)
-    blocks = jnp.where(here_down, across[None], blocks)
-    return blocks.reshape(cov.shape[:2] + blocks.shape[4:])
-
-
-@kernel
-def _reduced(cov: Array, cross: Array, weights: Array) -> Array:
-    """P - P H' K' with K' = weights."""
-    return cov - total(w[:, None] * c[None] for w, c in zip(weights, cross, strict=True))
-
-
-@kernel
-def _joseph(half: Array, weights: Array, correction: Array) -> Array:
-    """half + K correction, made symmetric."""
-    whole = half + total(w[:, None] * c[None] for w, c in zip(weights, correction, strict=True))
-    return (whole + jnp.swapaxes(whole, 0, 1)) / 2
+def _excess(share: Array) -> Array:
+    """1 / g - 1, finite for g = 0."""
+    return 1 / jnp.maximum(share, jnp.sqrt(jnp.finfo(share.dtype).tiny)) - 1

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from late_streams import exact, problem, stream
+from late_streams import chain, exact, problem, stream
 
 import ewif_jax as ej
 from ewif_jax.oosm.asd import asd
@@ -32,6 +32,34 @@ def test_asd_and_replay_are_exact(n, m, rank):
         np.testing.assert_array_equal(
             trace.info.status, np.where(late, ej.Status.LATE_USED, ej.Status.USED)
         )
+
+
+@pytest.mark.parametrize("affine", [False, True], ids=["orthogonal", "affine"])
+@pytest.mark.parametrize(("n", "seed"), [(3, 0), (3, 1), (4, 2), (4, 3)])
+def test_asd_is_exact_where_one_noise_drives_a_chain(n, seed, affine):
+    """Integrators in axes that mix them, at intervals from 0.02 to 1: the smallest variance of the
+    process noise of an interval is far below the rounding of its largest."""
+    given = chain(seed, n, affine)
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(np.exp(rng.uniform(np.log(0.02), 0.0, 14)))
+    times[7] = times[6]
+    times = times[np.argsort(times + rng.exponential(2.0, 14))]
+    data = stream(given, rng, times)
+    assert (np.diff(times) < 0).sum() >= 3
+    trace = ej.run(asd(given.model, 14), None, data, prior=given.prior, t0=0.0)
+    means, covs = exact(given, data)
+    np.testing.assert_allclose(trace.mean, means, atol=1e-8)
+    np.testing.assert_allclose(trace.cov, covs, atol=1e-8)
+
+
+def test_asd_is_exact_without_process_noise():
+    given = problem(8, 4, 2, 0)
+    rng = np.random.default_rng(8)
+    data = stream(given, rng, shuffled(rng, 14))
+    means, covs = exact(given, data)
+    trace = ej.run(asd(given.model, 14), None, data, prior=given.prior, t0=0.0)
+    np.testing.assert_allclose(trace.mean, means, atol=1e-8)
+    np.testing.assert_allclose(trace.cov, covs, atol=1e-8)
 
 
 def test_asd_is_exact_for_all_that_it_accepts():
