@@ -10,6 +10,7 @@ from jax import Array
 
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.batched import kernel, total
+from ewif_jax.kernels.small import matmul
 from ewif_jax.kernels.sparse import Pattern, by_row, full
 
 
@@ -102,11 +103,11 @@ def update_from_afar(
     """`update` by a measurement of something else: `cross` (m, n) is its covariance with the state,
     `spread` (m, m) its own without noise."""
     innovation = innovate(difference, cross, spread + R, mask)
-    weights = cholesky.solved(innovation.cov, innovation.cross)
+    weights = cholesky.solve(innovation.factor, innovation.cross)
     mean = _moved(mean, weights, innovation.value)
-    half = _reduced(packed, innovation.cross, weights)
+    half = _less(packed, innovation.cross, weights)
     seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask[None, :], spread, 0), weights)
-    return mean, _joseph(half, seen, mask_cov(R, mask), weights), innovation
+    return mean, _more(half, weights, _left_over(mask_cov(R, mask), weights, seen)), innovation
 
 
 @kernel
