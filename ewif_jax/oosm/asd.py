@@ -12,7 +12,7 @@ from ewif_jax.estimator import choose, verdict
 from ewif_jax.forms.innovations import Compared, sound
 from ewif_jax.kernels import cholesky, gaussian, slots, symmetric, window
 from ewif_jax.kernels.small import matmul, matvec
-from ewif_jax.models import Model, flow, sight
+from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -65,6 +65,10 @@ def asd(model: Model, lag: int) -> Estimator:
         lag: how many measurements are kept, >= 1. One older than the newest that has left, or than
             t0, is `TOO_LATE`.
 
+    U is a difference: where the kept measurements leave less of it than the rounding of what it was
+    (in float32 less than about 1e-6: a vague prior, precise sensors, and a measurement older than
+    the first), use `replay` or float64.
+
     Reduces to: `kalman` (or `extended`) in sequence; `replay` of it for a linear model.
 
     Raises:
@@ -92,9 +96,9 @@ def asd(model: Model, lag: int) -> Estimator:
         ahead = jnp.maximum(time, state.time)
         mean, F, Q = flow(model, params, state.mean, state.time, ahead)
         checks.shape("F", F, (state.mean.shape[0],) * 2)
-        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
         known = time >= state.time
-        mean, cov = jnp.where(known, mean, jnp.nan), jnp.where(known, cov, jnp.nan)
+        cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
+        mean = jnp.where(known, mean, jnp.nan)
         return state._replace(time=time, mean=mean, cov=cov, F=matmul(F, state.F))
 
     def update(
@@ -165,7 +169,7 @@ def _split(
     end = jnp.where(place < count, slots.picked(kept.time, index == place), state.time)
     time = jnp.clip(time, start, state.time)
     mean, F, Q = flow(model, params, mean, start, time)
-    cov = symmetric.congruence(F, cov) + symmetric.pack(Q)
+    cov = symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
     mean, cov, F = choose(
         time < state.time, (mean, cov, F), (state.mean, state.cov, state.F)
     )  # in sequence exactly what the filter has

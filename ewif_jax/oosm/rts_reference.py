@@ -11,7 +11,7 @@ from ewif_jax.forms.covariance import CovarianceState
 from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.small import matmul, matvec
-from ewif_jax.models import Model, flow, sight
+from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
 from ewif_jax.types import Estimator, Info, Measurement
 
@@ -93,7 +93,7 @@ def _tied(
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
     nearest, _ = lax.scan(back, now, state.past)
     mean, F, Q = flow(model, params, start.mean, start.time, time)
-    cov = symmetric.congruence(F, start.cov) + symmetric.pack(Q)
+    cov = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q)
     tie = _behind(model, params, nearest, CovarianceState(time, mean, cov))
     return choose(time < nearest.time, tie, nearest)
 
