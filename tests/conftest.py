@@ -40,6 +40,7 @@ if platform.machine() in ("x86_64", "AMD64"):
     )
 """About a quarter of the time that XLA takes by default, for programs that mostly run once."""
 
+LONGEST = ("test_tuning", "test_notebooks", "test_float32", "test_pcrlb")
 MAPS = Path("/proc/self/maps")
 _tests = itertools.count(1)
 
@@ -71,11 +72,13 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     """Leaves out what is slow and covered otherwise, unless `--all`. With `--dist loadgroup`, tests
     that share what they compile run in one process: those of a file, or in tests/contracts those of
-    an estimator."""
+    an estimator. The longest groups of the last files come first, lest one process waits for the
+    other at the end."""
     if not config.getoption("--all"):
         left_out = [item for item in items if _slow(item)]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if not _slow(item)]
+    items.sort(key=lambda item: Path(item.fspath).stem not in LONGEST)
     for item in items:
         row = getattr(item, "callspec", None) and item.callspec.params.get("row")
         if config.pluginmanager.hasplugin("xdist"):
