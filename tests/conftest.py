@@ -40,7 +40,7 @@ if platform.machine() in ("x86_64", "AMD64"):
     )
 """About a quarter of the time that XLA takes by default, for programs that mostly run once."""
 
-LONGEST = ("test_tuning", "test_notebooks", "test_float32", "test_pcrlb")
+LONGEST = ("test_tuning", "test_notebooks", "test_float32", "test_pcrlb", "test_late_studies")
 MAPS = Path("/proc/self/maps")
 _tests = itertools.count(1)
 
