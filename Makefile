@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STUDY := .venv/.study
 DEV := .venv/.dev
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test test-all lint types check bench reproduce clean
 
@@ -10,10 +11,10 @@ demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
 
 test: $(DEV)  ## all tests, on all cores
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(PYTEST)
 
 test-all: $(DEV)  ## the slow ones too
-	$(BIN)/python -m pytest -n auto --dist loadgroup --all
+	$(PYTEST) --all
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -5,6 +5,8 @@ with `--all` as for a user."""
 import gc
 import itertools
 import os
+import platform
+import subprocess
 import sys
 from pathlib import Path
 
@@ -27,6 +29,18 @@ settings.register_profile(
 )
 settings.load_profile("few")
 
+QUICK_TO_COMPILE = ("--xla_cpu_use_fusion_emitters=false",)
+if platform.machine() in ("x86_64", "AMD64"):
+    QUICK_TO_COMPILE += (
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_parallel_codegen_split_count=1",
+        # Unoptimised code fuses some multiplications with additions and not others. With none,
+        # programs that share random numbers round them equally.
+        "--xla_cpu_max_isa=AVX",
+    )
+"""About a quarter of the time that XLA takes by default, for programs that mostly run once."""
+
+LONGEST = ("test_tuning", "test_notebooks", "test_float32", "test_pcrlb", "test_late_studies")
 MAPS = Path("/proc/self/maps")
 _tests = itertools.count(1)
 
@@ -47,21 +61,24 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     if not config.getoption("--all") and jaxlib.version.__version_info__ < (0, 11):
-        # Compiling takes most of the time. A later XLA might not know the flag, and stop.
-        flags = (os.environ.get("XLA_FLAGS", ""), "--xla_cpu_use_fusion_emitters=false")
+        # Compiling takes most of the time. A later XLA might not know the flags, and stop.
+        flags = (os.environ.get("XLA_FLAGS", ""), *QUICK_TO_COMPILE)
         os.environ["XLA_FLAGS"] = " ".join(flags).strip()
     config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
+    config.addinivalue_line("markers", "optimised: in a process that compiles as for a user")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(config, items):
     """Leaves out what is slow and covered otherwise, unless `--all`. With `--dist loadgroup`, tests
     that share what they compile run in one process: those of a file, or in tests/contracts those of
-    an estimator."""
+    an estimator. The longest groups of the last files come first, lest one process waits for the
+    other at the end."""
     if not config.getoption("--all"):
         left_out = [item for item in items if _slow(item)]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if not _slow(item)]
+    items.sort(key=lambda item: Path(item.fspath).stem not in LONGEST)
     for item in items:
         row = getattr(item, "callspec", None) and item.callspec.params.get("row")
         if config.pluginmanager.hasplugin("xdist"):
@@ -72,3 +89,24 @@ def pytest_collection_modifyitems(config, items):
 def _slow(item):
     row = getattr(item, "callspec", None) and item.callspec.params.get("row")
     return item.get_closest_marker("slow") is not None or getattr(row, "variant", False)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """A test marked `optimised` runs in a process of its own, compiled as for a user."""
+    config = pyfuncitem.config
+    if config.getoption("--all") or pyfuncitem.get_closest_marker("optimised") is None:
+        return None
+    kept = [x for x in os.environ.get("XLA_FLAGS", "").split() if x not in QUICK_TO_COMPILE]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
+    nodeid = pyfuncitem.nodeid.split("@")[0]  # without the group of xdist
+    found = subprocess.run(
+        [sys.executable, "-m", "pytest", "--all", "-p", "no:xdist", nodeid],
+        cwd=config.rootpath,
+        env=environment | {"XLA_FLAGS": " ".join(kept)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout
+    return True

@@ -219,7 +219,10 @@ def test_gradient_is_finite_and_the_finite_difference(row):
 def test_padding_is_a_no_op(row):
     state = streamed(row).states[5]
     nothing = Measurement(
-        jnp.asarray(LAST), jnp.full(2, jnp.nan), jnp.asarray(1, jnp.int32), jnp.zeros(2, bool)
+        jnp.asarray(LAST, float),  # with a dtype: not another program for weak types
+        jnp.full(2, jnp.nan, float),
+        jnp.asarray(1, jnp.int32),
+        jnp.zeros(2, bool),
     )
     padded, info = built(row).step(PARAMS, state, nothing)
     assert identical(padded, state)
@@ -251,7 +254,7 @@ def test_what_is_not_a_number_is_rejected_and_changes_nothing(row, bad, age):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_time_that_is_not_a_number_is_rejected(row, bad):
     state = streamed(row).states[6]
-    after, info = built(row).step(PARAMS, state, arrival(6)._replace(time=jnp.asarray(bad)))
+    after, info = built(row).step(PARAMS, state, arrival(6)._replace(time=jnp.asarray(bad, float)))
     assert info.status == Status.REJECTED
     assert identical(after, state)
     assert all(np.isfinite(x).all() for x in info)

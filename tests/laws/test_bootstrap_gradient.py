@@ -28,6 +28,12 @@ LONG = ej.stream(
 
 
 @cache
+def resampled(particles):
+    """Resampled after every measurement; the same filter each time, so it is compiled once."""
+    return bootstrap(MODEL, particles, ess_threshold=1.1)
+
+
+@cache
 def slopes(method, steps, keys):
     """Derivatives by q and r of the log likelihood of the first 1, 2, ..., `steps` measurements,
     each (steps,), of every one of (keys,) runs."""
@@ -69,7 +75,7 @@ def test_on_average_it_is_the_kalman_filters(threshold):
 @pytest.mark.parametrize("name", PARAMS)
 def test_its_variance_grows_faster_than_the_square_of_the_number_of_steps(name):
     """Between 12 and 48 of them, by more than the scatter of 1000 runs."""
-    found = slopes(bootstrap(MODEL, 100, ess_threshold=1.1), STEPS, 1000)[name][:, [11, 47]]
+    found = slopes(resampled(100), STEPS, 1000)[name][:, [11, 47]]
     square = np.square(found - found.mean(0))
     scatter = square / square.mean(0)
     error = (scatter[:, 1] - scatter[:, 0]).std() / np.sqrt(1000) / np.log(4)
@@ -82,7 +88,7 @@ def test_its_bias_is_of_order_one_over_the_number_of_particles():
     expected = slopes(ej.kalman(MODEL), 12, None)["r"][-1]
     bias, error, keys = {}, {}, 8000
     for particles in (25, 100):
-        found = slopes(bootstrap(MODEL, particles, ess_threshold=1.1), 12, keys)["r"][:, -1]
+        found = slopes(resampled(particles), 12, keys)["r"][:, -1]
         bias[particles], error[particles] = found.mean() - expected, found.std() / np.sqrt(keys)
         assert abs(bias[particles]) > 4 * error[particles]
     assert abs(bias[25] - 4 * bias[100]) < 4 * np.hypot(error[25], 4 * error[100])

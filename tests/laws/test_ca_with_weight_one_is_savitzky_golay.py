@@ -10,6 +10,7 @@ from ewif_jax.models import constant_acceleration, position_sensor
 DT, LENGTH = 0.1, 11
 MODEL = constant_acceleration(sensors=position_sensor(0.3))
 TIMES = DT * np.arange(40)
+WINDOWED = ej.limited_memory(MODEL, (LENGTH - 0.5) * DT, LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +20,7 @@ def values():
 
 
 def windowed(values, times=None):
-    filt = ej.limited_memory(MODEL, (LENGTH - 0.5) * DT, LENGTH)
-    return ej.run(filt, None, ej.stream(TIMES, values), prior=None, t0=0.0, times=times)
+    return ej.run(WINDOWED, None, ej.stream(TIMES, values), prior=None, t0=0.0, times=times)
 
 
 @pytest.mark.parametrize("deriv", [0, 1, 2])

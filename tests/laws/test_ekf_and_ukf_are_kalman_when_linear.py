@@ -21,6 +21,7 @@ FILTERS = {
     "extended": ej.extended(FUNCTIONS),
     "unscented": unscented(FUNCTIONS, ut_alpha=alpha, ut_beta=2.0, ut_kappa=0.5),
 }
+KALMAN = ej.kalman(model())
 WIDE, NARROW = 1.0, 0.05
 
 
@@ -32,7 +33,7 @@ def test_mean_cov_and_diagnostics(name, spread, noise_rank):
     world = case(14, 3, noise_rank)
     options = {"prior": world.prior, "t0": 0.0}
     params = {**world.params, "ut_alpha": spread}
-    expected = ej.run(ej.kalman(model()), params, world.stream(), **options)
+    expected = ej.run(KALMAN, params, world.stream(), **options)
     actual = ej.run(FILTERS[name], params, world.stream(), **options)
     close(actual.mean, expected.mean, 1e-10)
     close(actual.cov, expected.cov, 1e-10)
@@ -52,7 +53,7 @@ def test_a_singular_prior_and_its_gradients(name):
         return (trace.mean**2).sum() + trace.cov.sum() + trace.info.log_likelihood.sum()
 
     params = {**jax.tree.map(jax.numpy.asarray, world.params), "ut_alpha": 1.0}
-    expected, slopes = jax.value_and_grad(lambda p: loss(ej.kalman(model()), p))(params)
+    expected, slopes = jax.value_and_grad(lambda p: loss(KALMAN, p))(params)
     value, found = jax.value_and_grad(lambda p: loss(FILTERS[name], p))(params)
     close(value, expected)
     for key in ("rates", "u", "H"):
@@ -66,7 +67,7 @@ def test_a_singular_prior_and_its_gradients(name):
 def test_one_arrival_counts_once(name):
     """The same value twice, at the same time, is one value of half the variance: no more."""
     world = case(3, 3)
-    build = {"kalman": ej.kalman(model()), **FILTERS}[name]
+    build = {"kalman": KALMAN, **FILTERS}[name]
     params = {**world.params, "ut_alpha": 1.0}
     halved = {**params, "R": params["R"] / 2}
     one = jax.tree.map(lambda x: x[:1], world.stream())

@@ -32,6 +32,11 @@ FILTERS = {
 each = pytest.mark.parametrize("name", FILTERS)
 
 
+@cache
+def built(name, count):
+    return FILTERS[name][0](count)
+
+
 def limit(data, back):
     sensors = np.asarray(data.sensor)
     return enkf_limit(
@@ -48,8 +53,8 @@ def limit(data, back):
 @cache
 def errors(name, members):
     """Errors of means (RUNS, T, n) and of covariances, in standard deviations of the limit."""
-    build, times, back = FILTERS[name]
-    data, estimator = stream(PROBLEM, np.random.default_rng(0), times), build(members)
+    _, times, back = FILTERS[name]
+    data, estimator = stream(PROBLEM, np.random.default_rng(0), times), built(name, members)
 
     def shown(key):
         trace = ej.run(estimator, None, data, prior=PROBLEM.prior, t0=0.0, key=key)
@@ -92,8 +97,8 @@ def test_a_step_back_with_shared_noise_is_exact_at_a_stored_time_without_anythin
 def test_at_delay_zero_the_late_filters_are_the_ensemble_filter_member_by_member(name):
     data = stream(PROBLEM, np.random.default_rng(1), [0.0, 0.3, 0.3, 0.7, 1.0, 1.2])
     options = {"prior": PROBLEM.prior, "t0": 0.0, "key": jax.random.key(2)}
-    late = ej.run(FILTERS[name][0](6), None, data, **options)
-    plain = ej.run(FILTERS["stochastic"][0](6), None, data, **options)
+    late = ej.run(built(name, 6), None, data, **options)
+    plain = ej.run(built("stochastic", 6), None, data, **options)
     members = late.final_state.now.members
     np.testing.assert_allclose(members, plain.final_state.members, atol=1e-11)
     np.testing.assert_allclose(late.info.log_likelihood, plain.info.log_likelihood, atol=1e-11)

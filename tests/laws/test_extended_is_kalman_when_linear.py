@@ -15,13 +15,17 @@ def functions_only():
     return ej.Model(linear.transition, linear.process_cov, linear.observe, linear.measurement_cov)
 
 
-@pytest.mark.parametrize("build", [model, functions_only])
+KALMAN = ej.kalman(model())
+EXTENDED = {build: ej.extended(build()) for build in (model, functions_only)}
+
+
+@pytest.mark.parametrize("build", EXTENDED)
 @pytest.mark.parametrize("rank", [0, 3])
 def test_a_linear_world(build, rank):
     world = case(14, 3, rank)
     options = {"prior": world.prior, "t0": 0.0}
-    expected = ej.run(ej.kalman(model()), world.params, world.stream(), **options)
-    actual = ej.run(ej.extended(build()), world.params, world.stream(), **options)
+    expected = ej.run(KALMAN, world.params, world.stream(), **options)
+    actual = ej.run(EXTENDED[build], world.params, world.stream(), **options)
     for name in ("mean", "cov"):
         close(getattr(actual, name), getattr(expected, name))
     for name in ("innovation", "innovation_cov", "log_likelihood", "status"):
