@@ -99,8 +99,9 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    measurements, state = validated(estimator, params, measurements, prior, t0, times, clock, key)
-    prior = _prior(prior, measurements.value.dtype)
+    state = validated(estimator, params, measurements, prior, t0, times, clock, key)
+    dtype = float_dtype(measurements.value)
+    measurements, prior = cast(measurements, dtype), _prior(prior, dtype)
     filtered = _compiled(measurements.time.shape[0], state, key)
     return filtered(estimator, params, measurements, prior, t0, times, clock, key)
 
@@ -114,9 +115,9 @@ def validated(
     times: Any,
     clock: str,
     key: Any,
-) -> tuple[Measurement, Any]:
-    """The stream in one float dtype, after everything that can be known now has been checked, and
-    the shapes of the estimator's state."""
+) -> Any:
+    """The shapes of the estimator's state, after everything that can be known now has been
+    checked."""
     checks.stream(measurements)
     checks.prior(prior)
     checks.shape("t0", t0, ())
@@ -128,28 +129,27 @@ def validated(
     checks.resolvable(measurements.time, dtype)
     if times is not None:
         checks.report_times(times, jnp.shape(measurements.time)[0])
-    measurements = cast(measurements, dtype)
     sensors = checks.known(measurements.sensor)
-    # A NumPy table among the parameters could not be indexed while tracing.
-    params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, params)
+    last = None if sensors is None else np.int32(sensors.max())
 
     def first() -> Any:
-        state = initial(estimator, params, prior, t0, dtype, key)
-        one = jax.tree.map(lambda x: jnp.asarray(x)[0], measurements)
-        if sensors is not None:  # a known index is checked where the model is asked about it
-            one = one._replace(sensor=sensors.max())
-        return advance(estimator, params, state, one, None if times is None else times[0])
+        # A NumPy table among the parameters could not be indexed while tracing.
+        given = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, params)
+        state = initial(estimator, given, prior, t0, dtype, key)
+        one = jax.tree.map(lambda x: jnp.asarray(x)[0], cast(measurements, dtype))
+        if last is not None:  # a known index is checked where the model is asked about it
+            one = one._replace(sensor=last)
+        return advance(estimator, given, state, one, None if times is None else times[0])
 
     shapes = jnp.shape(measurements.value), times is None, clock
-    last = None if sensors is None else sensors.max()
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
     if trial is None:
-        return measurements, jax.eval_shape(first).kept
+        return jax.eval_shape(first).kept
     if trial not in _tried:
         if len(_tried) >= 1000:
             _tried.clear()
         _tried[trial] = jax.eval_shape(first).kept
-    return measurements, _tried[trial]
+    return _tried[trial]
 
 
 _tried: dict[Any, Any] = {}
@@ -175,7 +175,7 @@ def initial(
 
 def float_dtype(x: Any) -> Any:
     """The float dtype that `x` has, or would be promoted to."""
-    dtype = jnp.asarray(x).dtype
+    dtype = jax.dtypes.canonicalize_dtype(x.dtype) if hasattr(x, "dtype") else jnp.asarray(x).dtype
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.asarray(0.0).dtype
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import advance, initial, validated
+from ewif_jax.estimator import cast, float_dtype, advance, initial, validated
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.forms import information as form
 from ewif_jax.forms import passage as way
@@ -66,7 +66,8 @@ def run_parallel(
     known = method in ("blocked", "associative")
     checks.require(known, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
-    measurements, _ = validated(estimator, params, measurements, prior, t0, times, "validity", None)
+    validated(estimator, params, measurements, prior, t0, times, "validity", None)
+    measurements = cast(measurements, float_dtype(measurements.value))
     steps = measurements.value.shape[0]
     if block is None:
         block = isqrt(steps - 1) + 1 if method == "blocked" else 1
