@@ -128,7 +128,7 @@ def validated(
     dtype = float_dtype(measurements.value)
     checks.resolvable(measurements.time, dtype)
     if times is not None:
-        checks.report_times(times, jnp.shape(measurements.time)[0])
+        checks.report_times(times, np.shape(measurements.time)[0])
     sensors = checks.known(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
@@ -141,7 +141,7 @@ def validated(
             one = one._replace(sensor=last)
         return advance(estimator, given, state, one, None if times is None else times[0])
 
-    shapes = jnp.shape(measurements.value), times is None, clock
+    shapes = np.shape(measurements.value), times is None, clock
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
     if trial is None:
         return jax.eval_shape(first).kept
@@ -175,7 +175,7 @@ def initial(
 
 def float_dtype(x: Any) -> Any:
     """The float dtype that `x` has, or would be promoted to."""
-    dtype = jax.dtypes.canonicalize_dtype(x.dtype) if hasattr(x, "dtype") else jnp.asarray(x).dtype
+    dtype = jnp.result_type(x if hasattr(x, "dtype") else np.asarray(x))
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.asarray(0.0).dtype
 
 

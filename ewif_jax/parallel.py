@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, float_dtype, advance, initial, validated
+from ewif_jax.estimator import advance, cast, float_dtype, initial, validated
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.forms import information as form
 from ewif_jax.forms import passage as way

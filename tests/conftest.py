@@ -6,7 +6,6 @@ import gc
 import itertools
 import os
 import platform
-import subprocess
 import sys
 from pathlib import Path
 
@@ -65,7 +64,6 @@ def pytest_configure(config):
         flags = (os.environ.get("XLA_FLAGS", ""), *QUICK_TO_COMPILE)
         os.environ["XLA_FLAGS"] = " ".join(flags).strip()
     config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
-    config.addinivalue_line("markers", "optimised: in a process that compiles as for a user")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
@@ -89,24 +87,3 @@ def pytest_collection_modifyitems(config, items):
 def _slow(item):
     row = getattr(item, "callspec", None) and item.callspec.params.get("row")
     return item.get_closest_marker("slow") is not None or getattr(row, "variant", False)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem):
-    """A test marked `optimised` runs in a process of its own, compiled as for a user."""
-    config = pyfuncitem.config
-    if config.getoption("--all") or pyfuncitem.get_closest_marker("optimised") is None:
-        return None
-    kept = [x for x in os.environ.get("XLA_FLAGS", "").split() if x not in QUICK_TO_COMPILE]
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
-    nodeid = pyfuncitem.nodeid.split("@")[0]  # without the group of xdist
-    found = subprocess.run(
-        [sys.executable, "-m", "pytest", "--all", "-p", "no:xdist", nodeid],
-        cwd=config.rootpath,
-        env=environment | {"XLA_FLAGS": " ".join(kept)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert found.returncode == 0, found.stdout
-    return True

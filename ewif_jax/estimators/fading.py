@@ -37,7 +37,8 @@ def fading(
     Deviations: over one interval the inflation is at most 1 / eps of the dtype (a gap of 16 tau in
         float32, 36 tau in float64), and the largest variance at most the square root of the
         largest float: a covariance cannot hold "nothing is known" and R at once. After a longer gap
-        the old estimate therefore fades while new data arrive; `ewif` forgets it at once.
+        the old estimate therefore fades while new data arrive; `ewif` forgets it at once. The
+        variances are inflated by up to 8 n eps more, which rounding would otherwise take away.
 
     Raises:
         ValueError: both or neither of `fading` and `inflation`; fading < 1.

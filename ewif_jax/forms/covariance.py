@@ -4,12 +4,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import verdict
 from ewif_jax.forms.innovations import Compared, updated
-from ewif_jax.kernels import symmetric
+from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -31,7 +32,9 @@ def covariance_form(
     1 / eps: an old estimate then weighs less than rounding against the same amount of new data,
     while anything larger would drown R in the rounding of P and leave a P that is not a covariance.
     Over many intervals it saturates where the largest variance reaches the square root of the
-    largest float, so that "knows nothing" never becomes infinity.
+    largest float, so that "knows nothing" never becomes infinity. What an interval forgets, it
+    forgets down to rounding: the variances grow by that share of 8 n eps more than the rest, which
+    keeps the covariance of a single direction a covariance.
     """
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
@@ -52,7 +55,7 @@ def covariance_form(
             cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
         else:
             cov = symmetric.congruence(F, state.cov, patterns(model)[0])
-            cov = cov * _saturated(inflation(params, state.time, ahead), cov) + symmetric.pack(Q)
+            cov = _inflated(cov, inflation(params, state.time, ahead)) + symmetric.pack(Q)
             cov = jnp.where(known, cov, jnp.nan)
         return CovarianceState(time, jnp.where(known, mean, jnp.nan), cov)
 
@@ -88,6 +91,14 @@ def measure(
     difference = model.residual(measurement.value, predicted, measurement.sensor)
     seen = Compared(difference, H, R, measurement.mask)
     return updated(model, mean, cov, seen, patterns(model)[1])
+
+
+def _inflated(cov: Array, factor: Array) -> Array:
+    factor = _saturated(factor, cov)
+    rows, cols = np.triu_indices(symmetric.order(cov))
+    variances = jnp.asarray(rows == cols, cov.dtype)
+    rounding = cholesky.negligible(symmetric.order(cov), cov.dtype) * (1 - 1 / factor)
+    return cov * factor * (1 + rounding * variances)
 
 
 def _saturated(factor: Array, cov: Array) -> Array:
