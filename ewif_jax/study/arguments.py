@@ -82,7 +82,9 @@ def _track(parser: argparse.ArgumentParser) -> None:
     method.add_argument("--tau", type=positive, help="decay of the ewif, seconds")
     method.add_argument("--q", type=positive, help="process noise (m^2/s, m^2/s^3, m^2/s^5)")
     method.add_argument("--fading", type=above(1), help="Anderson's alpha per step, above 1")
-    method.add_argument("--lag", type=whole(1), default=4, help="past times that al1, or measurements that asd, keep (4)")
+    method.add_argument(
+        "--lag", type=whole(1), default=4, help="past times al1, or measurements asd, keeps (4)"
+    )
     tuning = parser.add_argument_group("tuning")
     tuning.add_argument("--tune", action="store_true", help="tau, q or fading, by gradient")
     tuning.add_argument(
