@@ -162,7 +162,7 @@ def _run_batch(
 
     def filtered(*inputs: Any) -> Any:
         runs = inputs[1].value.shape[0]
-        size = group_size(runs, _state_bytes(estimator, inputs, flags.tree, t0))
+        size = group_size(runs, _sizes(estimator, inputs, flags.tree, t0))
 
         def together(inputs: Any) -> Any:
             inputs, found = (
@@ -182,15 +182,15 @@ def _run_batch(
     return Trace(time, mean, cov, info, state)
 
 
-def _state_bytes(estimator: Estimator, inputs: Any, flags: Any, t0: Any) -> int:
-    """What the state of one run takes in memory."""
+def _sizes(estimator: Estimator, inputs: Any, flags: Any, t0: Any) -> list[int]:
+    """What each array of the state of one run takes in memory."""
 
     def start(inputs: Any) -> Any:
         params, measurements, prior, _, key, _ = first_run(inputs, flags)
         return initial(estimator, params, prior, t0, measurements.value.dtype, key)
 
     leaves = jax.tree.leaves(jax.eval_shape(start, inputs))
-    return sum(x.size * x.dtype.itemsize for x in leaves)
+    return [x.size * x.dtype.itemsize for x in leaves]
 
 
 def _everything(step: Step, context: Any) -> Step:

@@ -146,15 +146,17 @@ def _block(steps: int) -> int:
     return best if best >= 16 else steps
 
 
-def group_size(runs: int, state_bytes: int) -> int:
-    """How many runs to filter at once: a divisor of `runs` for which the states stay in the cache,
-    or 1 where that would leave too few to fill vectors (a state that large is a vector itself)."""
-    room = max(_CACHE // max(state_bytes, 1), 1)
+def group_size(runs: int, state: list[int]) -> int:
+    """How many runs to filter at once, from what each array of one run's state takes in bytes: a
+    divisor of `runs` for which the states stay in the cache and no array is so large that the
+    compiler would have several threads wait for each other at every step; or 1 where that would
+    leave too few to fill vectors (a state that large is a vector itself)."""
+    room = max(min(_CACHE // max(sum(state), 1), _UNDIVIDED // max(*state, 1)), 1)
     best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
     return best if best >= 16 else runs if room >= min(runs, 16) else 1
 
 
-_CACHE = 2**19
+_CACHE, _UNDIVIDED = 2**19, 2**18
 
 
 def in_groups(fn: Callable[[Any], Any], inputs: Any, flags: Any, runs: int, size: int) -> Any:

@@ -9,7 +9,7 @@ import pytest
 
 import ewif_jax as ej
 from ewif_jax.kernels import symmetric
-from ewif_jax.kernels.small import matvec
+from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.kernels.sparse import pattern
 from ewif_jax.models import patterns
 
@@ -46,11 +46,12 @@ def test_products_are_the_dense_ones(name, per_run):
             symmetric.unpack(added),
             symmetric.rows(a[:2], packed, where[:2]),
             matvec(a, x, where),
+            matmul(a, cov, where),
         )
 
     found = jax.jit(jax.vmap(all_of, (0 if per_run else None, 0, 0, 0)))(a, cov, plus, x)
     moved = a @ cov @ np.swapaxes(a, -1, -2)
-    wanted = moved, moved + plus, a[..., :2, :] @ cov, (a @ x[..., None])[..., 0]
+    wanted = moved, moved + plus, a[..., :2, :] @ cov, (a @ x[..., None])[..., 0], a @ cov
     one = all_of(a[0] if per_run else a, cov[0], plus[0], x[0])
     for got, alone, exact in zip(found, one, wanted, strict=True):
         np.testing.assert_allclose(got, exact, atol=1e-12)

@@ -145,7 +145,7 @@ def _sight(
     there = matvec(A, state.mean, F_where)
     there = there if c is None else there + c
     difference = model.residual(measurement.value, matvec(H, there, H_where), measurement.sensor)
-    seen = jnp.where(mask[:, None], matmul(H, A), 0)
+    seen = jnp.where(mask[:, None], matmul(H, A, H_where), 0)
     return seen, jnp.where(mask, difference, 0), R
 
 

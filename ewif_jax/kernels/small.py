@@ -20,9 +20,10 @@ from ewif_jax.kernels.batched import contiguous, kernel, stage, total
 from ewif_jax.kernels.sparse import Pattern, product
 
 
-def matmul(a: Array, b: Array) -> Array:
-    """`a @ b` for two matrices; under `vmap` the result is batched along its last axis."""
-    return _matmul_p.bind(a, b)
+def matmul(a: Array, b: Array, where: Pattern | None = None) -> Array:
+    """`a @ b` for two matrices, of which a may differ from zero `where`; under `vmap` the result is
+    batched along its last axis."""
+    return _matmul_p.bind(a, b) if where is None else _sparse(where)(a, b)
 
 
 def matvec(a: Array, x: Array, where: Pattern | None = None) -> Array:

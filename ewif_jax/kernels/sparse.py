@@ -65,5 +65,6 @@ def by_row(a: Array, where: Pattern) -> list[tuple[Array, np.ndarray]]:
 
 
 def product(a: Array, x: Array, where: Pattern) -> Array:
-    """a x for a matrix a (rows, k, ...) and a vector x (k, ...)."""
-    return total(factor * x[column] for factor, column in by_row(a, where))
+    """a x for a matrix a (rows, k, ...) and a vector x (k, ...) or matrix x (k, n, ...)."""
+    between = (slice(None), *(None,) * (x.ndim - a.ndim + 1))
+    return total(factor[between] * x[column] for factor, column in by_row(a, where))

@@ -99,6 +99,16 @@ def diagonal(packed: Array) -> Array:
     return packed[np.diagonal(places(n))]
 
 
+def regress(packed: Array, cross: Array) -> tuple[Array, Array]:
+    """B P^-1 (m, n) and B P^-1 B' (m, m) for a packed P and B (m, n): the weights of the regression
+    on what has covariance P, and what they explain.
+
+    A pivot that is zero to rounding (below 8 n eps times its diagonal element) is left out, with
+    derivative 0.
+    """
+    return _regress(packed, cross)
+
+
 def inverse(packed: Array) -> tuple[Array, Array]:
     """P^-1, packed, and whether P has full rank; where it has not, the identity with derivative 0.
 
@@ -109,6 +119,61 @@ def inverse(packed: Array) -> tuple[Array, Array]:
     full_rank = jnp.all(diagonal(result) > 0)
     identity = pack(jnp.eye(order(packed), dtype=packed.dtype))
     return jnp.where(full_rank, result, identity), full_rank
+
+
+@kernel
+def _regress(packed: Array, cross: Array) -> tuple[Array, Array]:
+    """Elimination row by row of [[P, B'], [B, 0]], and back for the rows of the weights."""
+    (m, n), batch = cross.shape[:2], packed.ndim - 1
+    least = _least(packed)
+    rest, eliminated = stage(_bordered, packed, cross, batch=batch), []
+    for k in range(n):
+        reciprocal = stage(_reciprocal, rest[0], least[k], batch=batch)
+        eliminated.append((rest[: n - k + m], reciprocal))
+        rest = stage(_eliminated, rest, reciprocal, batch=batch)
+    weights: list[Array] = []
+    for row, reciprocal in reversed(eliminated):
+        weights.insert(0, stage(_weights, row, reciprocal, *weights, batch=batch))
+    return jnp.stack(weights, 1), -rest[places(m)]
+
+
+def _bordered(packed: Array, cross: Array) -> Array:
+    """[[P, B'], [B, 0]], packed."""
+    m, n = cross.shape[:2]
+    runs = jnp.broadcast_shapes(packed.shape[1:], cross.shape[2:])
+    parts = packed, cross.reshape(m * n, *cross.shape[2:]), jnp.zeros_like(packed[:1])
+    numbers = jnp.concatenate([jnp.broadcast_to(x, (len(x), *runs)) for x in parts])
+    index = np.full((n + m, n + m), len(numbers) - 1)
+    index[:n, :n] = places(n)
+    index[:n, n:] = len(packed) + np.arange(m * n).reshape(m, n).T
+    return numbers[index[np.triu_indices(n + m)]]
+
+
+def _reciprocal(pivot: Array, least: Array) -> Array:
+    """1 / pivot, or 0 where there is none."""
+    kept = pivot > least
+    return jnp.where(kept, 1 / jnp.where(kept, pivot, 1), 0)
+
+
+def _eliminated(rest: Array, reciprocal: Array) -> Array:
+    """The packed matrix without its first unknown."""
+    n = order(rest)
+    rows, cols = np.triu_indices(n - 1)
+    first = rest[1:n]
+    return rest[n:] - reciprocal[None] * first[rows] * first[cols]
+
+
+def _weights(row: Array, reciprocal: Array, *later: Array) -> Array:
+    """The weights (m,) of an unknown: from its row when it was eliminated, and later weights."""
+    known = row[1 + len(later) :]
+    for factor, weights in zip(row[1:], later, strict=False):
+        known = known - factor[None] * weights
+    return known * reciprocal[None]
+
+
+def _least(packed: Array) -> Array:
+    """Below this a pivot counts as zero."""
+    return 8 * order(packed) * float(jnp.finfo(packed.dtype).eps) * diagonal(packed)
 
 
 @jax.custom_jvp
@@ -125,8 +190,7 @@ def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
 @kernel
 def _swept(packed: Array) -> Array:
     """Gauss-Jordan elimination without exchanges; zero rows where there is no pivot."""
-    n, batch = order(packed), packed.ndim - 1
-    least = 8 * n * float(jnp.finfo(packed.dtype).eps) * diagonal(packed)
+    n, batch, least = order(packed), packed.ndim - 1, _least(packed)
     for k in range(n):
         packed = stage(_sweep(n, k), packed, least[k], batch=batch)
     return -packed
@@ -140,8 +204,7 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
         """Exchanges the roles of unknown and right-hand side number k."""
         shape = (-1, *(1,) * (packed.ndim - 1))
         pivot = packed[places(n)[k, k]]
-        kept = pivot > least
-        reciprocal = jnp.where(kept, 1 / jnp.where(kept, pivot, 1), 0)
+        reciprocal = _reciprocal(pivot, least)
         left = jnp.where((rows == k).reshape(shape), -1, packed[places(n)[k, rows]])
         right = jnp.where((cols == k).reshape(shape), -1, packed[places(n)[k, cols]])
         others = jnp.where(((rows == k) | (cols == k)).reshape(shape), 0, packed)

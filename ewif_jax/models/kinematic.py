@@ -4,6 +4,7 @@ The state lists the position first, then the velocity, then the acceleration: [x
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from math import factorial
 from typing import Any, Literal
 
@@ -12,10 +13,12 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels.small import matvec
-from ewif_jax.kernels.sparse import pattern
+from ewif_jax.kernels.batched import kernel
+from ewif_jax.kernels.sparse import Pattern, pattern
 from ewif_jax.models.model import Linear, Model, affine_motion, resolve
 from ewif_jax.models.sensors import Sensor, bank
+
+Function = Callable[[Array], Array]
 
 
 def random_walk(
@@ -77,58 +80,70 @@ def _kinematic(
         checks.at_least("q", q, 0.0)
     n = (order + 1) * dims
     observe, cov, residual, matrix, count = bank(sensors)
-    F_terms = np.kron(_motion(order), np.eye(dims))
-    noise_terms = _white(order) if noise == "white" else _piecewise_constant(order)
-    Q_terms = np.kron(noise_terms, np.eye(dims))
+    motion, spread, F_where = _matrices(order, dims, noise)
 
     def F(params: Any, t0: Array, t1: Array) -> Array:
         del params
-        return _polynomial(F_terms, t1 - t0)
+        return motion(_interval(t0, t1))
 
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
-        return resolve(q, params) * _polynomial(Q_terms, t1 - t0)
+        return resolve(q, params) * spread(_interval(t0, t1))
 
     linear = None
     if matrix is not None:
         H, H_where = matrix(n)
-        linear = Linear(F, b, H, pattern(*F_terms), H_where)
+        linear = Linear(F, b, H, F_where, H_where)
     transition = affine_motion(F, b)
     return Model(transition, process_cov, observe, cov, residual, linear, count)
 
 
-def _polynomial(terms: np.ndarray, dt: Array) -> Array:
-    """sum_k terms[k] dt^k for constant matrices terms (K, n, n): one product."""
-    dt = jnp.asarray(dt)
-    powers = [jnp.ones_like(dt)]
-    for _ in range(len(terms) - 1):
-        powers.append(powers[-1] * dt)
-    flat = jnp.asarray(terms.reshape(len(terms), -1).T, dt.dtype)
-    return matvec(flat, jnp.stack(powers)).reshape(terms.shape[1:])
+def _interval(t0: Any, t1: Any) -> Array:
+    dt = jnp.asarray(t1) - t0
+    return dt.astype(jnp.result_type(dt, 0.0))
 
 
-def _motion(order: int) -> np.ndarray:
-    terms = np.zeros((order + 1, order + 1, order + 1))
-    for i in range(order + 1):
-        for j in range(i, order + 1):
-            terms[j - i, i, j] = 1 / factorial(j - i)
-    return terms
+@cache
+def _matrices(order: int, dims: int, noise: str) -> tuple[Function, Function, Pattern]:
+    """dt () -> F and Q / q (n, n), and where F may differ from zero."""
+    coefficient, power = _motion(order)
+    motion = _monomials(coefficient, power, dims)
+    noise_terms = _white(order) if noise == "white" else _held(order)
+    return motion, _monomials(*noise_terms, dims), pattern(np.kron(coefficient, np.eye(dims)))
 
 
-def _white(order: int) -> np.ndarray:
+def _monomials(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Function:
+    """dt () -> coefficient dt^power, element by element, the same in every dimension."""
+    coefficient = np.kron(coefficient, np.eye(dims))
+    power = np.kron(power, np.ones((dims, dims), int))
+
+    def matrix(dt: Array) -> Array:
+        powers = [jnp.ones_like(dt)]
+        for _ in range(power.max()):
+            powers.append(powers[-1] * dt)
+        across = (..., *(None,) * dt.ndim)
+        return jnp.stack(powers)[power] * jnp.asarray(coefficient, dt.dtype)[across]
+
+    return kernel(matrix, cheap=True)
+
+
+def _motion(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients and powers (order + 1, order + 1) of F: dt^(j - i) / (j - i)!."""
+    i, j = np.indices((order + 1, order + 1))
+    power = np.maximum(j - i, 0)
+    return np.where(j >= i, 1 / _factorial(power), 0), power
+
+
+def _white(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of white noise on the highest derivative: integral of the propagated noise."""
-    terms = np.zeros((2 * order + 2, order + 1, order + 1))
-    for i in range(order + 1):
-        for j in range(order + 1):
-            a, c = order - i, order - j
-            terms[a + c + 1, i, j] = 1 / (factorial(a) * factorial(c) * (a + c + 1))
-    return terms
+    a, c = order - np.indices((order + 1, order + 1))
+    return 1 / (_factorial(a) * _factorial(c) * (a + c + 1)), a + c + 1
 
 
-def _piecewise_constant(order: int) -> np.ndarray:
+def _held(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of the next derivative held constant over the interval (DWNA for order 1)."""
-    terms = np.zeros((2 * (order + 1) + 1, order + 1, order + 1))
-    for i in range(order + 1):
-        for j in range(order + 1):
-            a, c = order + 1 - i, order + 1 - j
-            terms[a + c, i, j] = 1 / (factorial(a) * factorial(c))
-    return terms
+    a, c = order + 1 - np.indices((order + 1, order + 1))
+    return 1 / (_factorial(a) * _factorial(c)), a + c
+
+
+def _factorial(x: np.ndarray) -> np.ndarray:
+    return np.vectorize(factorial)(x)

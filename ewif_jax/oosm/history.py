@@ -100,22 +100,23 @@ def late_update(
     at = jnp.clip(measurement.time, start.time, state.time)
     predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
-    M = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q_all)
+    F_where, H_where = patterns(model)
+    M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
-    f = cholesky.factor(symmetric.unpack(M))  # Q is part of M: what M has not, Q has not
-    origin = state.mean
-    if noise_estimated:
-        origin = origin - matvec(Q, cholesky.solve(f, state.mean - predicted))
+    moved, origin = state.mean - predicted, state.mean
+    if noise_estimated and model.linear is None:
+        origin = origin - matvec(Q, cholesky.solved(symmetric.unpack(M), moved))
     there, back, _ = flow(model, params, origin, state.time, at)
     value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    seen = matmul(H, back)
+    seen = matmul(H, back, H_where)
     noisy = matmul(seen, Q)
-    root = cholesky.forward(f, noisy.T)
-    weights = cholesky.backward(f, root)
-    H_now = seen - weights.T
-    known = root if noise_estimated else matmul(symmetric.unpack(state.cov), weights)
-    R_now = R + matmul(noisy, seen.T) - matmul((root if noise_estimated else weights).T, known)
+    weights, explained = symmetric.regress(M, noisy)  # Q is part of M: what M has not, Q has not
+    if noise_estimated and model.linear is not None:
+        value = value - matvec(weights, moved)
+    if not noise_estimated:
+        explained = matmul(symmetric.rows(weights, state.cov), weights.T)
+    H_now, R_now = seen - weights, R + matmul(noisy, seen.T) - explained
     difference = model.residual(measurement.value, value, measurement.sensor)
     seen = Compared(difference, H_now, R_now, measurement.mask)
     return updated(model, state.mean, state.cov, seen)
