@@ -136,19 +136,21 @@ def validated(
         # A NumPy table among the parameters could not be indexed while tracing.
         given = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, params)
         state = initial(estimator, given, prior, t0, dtype, key)
+        if not last and not jax.tree.leaves(params):
+            return state  # nothing is known that the program itself would not refuse
         one = jax.tree.map(lambda x: jnp.asarray(x)[0], cast(measurements, dtype))
         if last is not None:  # a known index is checked where the model is asked about it
             one = one._replace(sensor=last)
-        return advance(estimator, given, state, one, None if times is None else times[0])
+        return advance(estimator, given, state, one, None if times is None else times[0]).kept
 
     shapes = np.shape(measurements.value), times is None, clock
     trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
     if trial is None:
-        return jax.eval_shape(first).kept
+        return jax.eval_shape(first)
     if trial not in _tried:
         if len(_tried) >= 1000:
             _tried.clear()
-        _tried[trial] = jax.eval_shape(first).kept
+        _tried[trial] = jax.eval_shape(first)
     return _tried[trial]
 
 

@@ -1,18 +1,20 @@
 """Tuning by gradient: losses of an estimator's parameters, and an optax loop over them."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from ewif_jax import checks, scores
 from ewif_jax.scores import Score, average, scored
 from ewif_jax.types import Estimator, Measurement
+
+if TYPE_CHECKING:
+    import optax
 
 Loss = Callable[..., Array]
 FORWARD_UP_TO = 4
@@ -63,7 +65,7 @@ def tune(
     params: Any,
     *,
     steps: int = 200,
-    optimizer: optax.GradientTransformation | None = None,
+    optimizer: "optax.GradientTransformation | None" = None,
     transforms: Any = None,
     key: Any = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -89,6 +91,8 @@ def tune(
         ValueError: steps < 1, a parameter that its transform cannot hold, a loss that is not a
             finite number at the start.
     """
+    import optax  # here, because it takes longer to import than the rest of the package
+
     steps = checks.whole("steps", steps, 1)
     params = jax.tree.map(_as_float, params)
     if transforms is None:

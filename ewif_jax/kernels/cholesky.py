@@ -4,12 +4,11 @@ A pivot that is zero to rounding is skipped (its row of the solution is zero), s
 by zero and gradients stay finite where a matrix is singular.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from ewif_jax.kernels.batched import kernel, stage
@@ -82,39 +81,48 @@ def _solved(tolerance: float) -> Callable[[Array, Array], Array]:
 
 
 def _factored(a: Array, tolerance: float) -> tuple[Array, Array]:
-    columns, reciprocals = [], []
-    for j in range(a.shape[0]):
-        column, reciprocal = _apart(_column(j, tolerance), a, *columns, batch=a.ndim - 2)
-        columns.append(column)
+    n, batch = a.shape[0], a.ndim - 2
+    columns, reciprocals, rest = [], [], a
+    for j in range(n):
+        column, reciprocal = _apart(n, _column(tolerance), rest, a[j, j], batch=batch)
+        columns.append(lax.pad(column, jnp.zeros((), a.dtype), [(j, 0, 0), *[(0, 0, 0)] * batch]))
         reciprocals.append(reciprocal)
+        if j < n - 1:
+            below = column[1:]
+            rest = _apart(n, _less, rest[1:, 1:], below[:, None], below[None], batch=batch)
     return jnp.stack(columns, 1), jnp.stack(reciprocals)
 
 
 @cache
-def _column(j: int, tolerance: float) -> Callable[..., tuple[Array, Array]]:
-    """(a, columns before j) -> column j of the factor, and the reciprocal of its pivot."""
+def _column(tolerance: float) -> Callable[..., tuple[Array, Array]]:
+    """(what is left of a, the diagonal element as it was) -> the first column of the factor, and
+    the reciprocal of its pivot."""
 
-    def column(a: Array, *columns: Array) -> tuple[Array, Array]:
-        rest = _less(a[:, j], [c[j] for c in columns], columns)
-        kept = rest[j] > tolerance * a[j, j]
-        reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, rest[j], 1)), 0)
-        below = np.arange(a.shape[0]).reshape(-1, *(1,) * (a.ndim - 2)) >= j
-        return jnp.where(below, rest * reciprocal[None], 0), reciprocal
+    def column(rest: Array, diagonal: Array) -> tuple[Array, Array]:
+        pivot = rest[0, 0]
+        kept = pivot > tolerance * diagonal
+        reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, pivot, 1)), 0)
+        return rest[:, 0] * reciprocal[None], reciprocal
 
     return column
 
 
 def _forward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
-    x: list[Array] = []
-    for j in range(b.shape[0]):
-        x.append(_apart(_row(j, True), lower, reciprocal, b, *x, batch=lower.ndim - 2))
+    n, x = len(b), []
+    for j in range(n):
+        x.append(_scaled(b[0], reciprocal[j]))
+        if j < n - 1:
+            factors = lower[j + 1 :, j]
+            b = _apart(n, _less, b[1:], _wide(factors, b), x[-1][None], batch=lower.ndim - 2)
     return jnp.stack(x)
 
 
 def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
-    x: list[Array] = []
-    for j in reversed(range(b.shape[0])):
-        x.insert(0, _apart(_row(j, False), lower, reciprocal, b, *x, batch=lower.ndim - 2))
+    n, x = len(b), []
+    for j in reversed(range(n)):
+        x.insert(0, _scaled(b[-1], reciprocal[j]))
+        if j > 0:
+            b = _apart(n, _less, b[:-1], _wide(lower[j, :j], b), x[0][None], batch=lower.ndim - 2)
     return jnp.stack(x)
 
 
@@ -125,28 +133,19 @@ def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
 _forward, _backward, _solve = map(kernel, (_forward_rows, _backward_rows, _solve_rows))
 
 
-@cache
-def _row(j: int, down: bool) -> Callable[..., Array]:
-    """(lower, reciprocals, b, rows solved before) -> row j of the solution."""
-
-    def row(lower: Array, reciprocal: Array, b: Array, *x: Array) -> Array:
-        return _times(_less(b[j], lower[j, :j] if down else lower[j + 1 :, j], x), reciprocal[j])
-
-    return row
+def _apart(n: int, fn: Callable[..., Any], *args: Array, batch: int) -> Any:
+    """`fn`, computed once where recomputing for an (n, n) matrix would add up."""
+    return stage(fn, *args, batch=batch) if n > 3 else fn(*args)
 
 
-def _apart(fn: Callable[..., Any], *args: Array, batch: int) -> Any:
-    """`fn` of arrays, the first of them (n, n), computed once where recomputing would add up."""
-    return stage(fn, *args, batch=batch) if args[0].shape[0] > 3 else fn(*args)
+def _less(x: Array, a: Array, b: Array) -> Array:
+    return x - a * b
 
 
-def _less(b: Array, numbers: Any, arrays: Sequence[Array]) -> Array:
-    """b minus the sum of numbers times arrays."""
-    for number, array in zip(numbers, arrays, strict=True):
-        b = b - _times(array, number)
-    return b
-
-
-def _times(x: Array, number: Array) -> Array:
-    """x times a number; x may have one axis more."""
+def _scaled(x: Array, number: Array) -> Array:
     return x * (number if x.ndim == number.ndim else number[None])
+
+
+def _wide(x: Array, like: Array) -> Array:
+    """`x` with the axis that right-hand sides have, if there is one in `like`."""
+    return x[:, None] if like.ndim > x.ndim else x

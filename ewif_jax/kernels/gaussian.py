@@ -11,7 +11,7 @@ from jax import Array
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.batched import kernel, total
 from ewif_jax.kernels.small import matmul
-from ewif_jax.kernels.sparse import Pattern, by_row, full
+from ewif_jax.kernels.sparse import Pattern, by_row, full, multiplied
 
 
 class Innovation(NamedTuple):
@@ -85,6 +85,8 @@ def _expected(where: Pattern | None) -> Callable[[Array, Array, Array], Array]:
     @kernel
     def expected(cross: Array, H: Array, R: Array) -> Array:
         """H P H' + R, from H P."""
+        if H.ndim == 2:
+            return R + multiplied(cross, H.T)
         terms = by_row(H, where or full(*H.shape[:2]))
         return R + total(cross[:, column] * factor[None] for factor, column in terms)
 

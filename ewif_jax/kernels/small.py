@@ -17,7 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from ewif_jax.kernels.batched import contiguous, kernel, stage, total
-from ewif_jax.kernels.sparse import Pattern, product
+from ewif_jax.kernels.sparse import Pattern, multiplied, product
 
 
 def matmul(a: Array, b: Array, where: Pattern | None = None) -> Array:
@@ -38,8 +38,8 @@ def _sparse(where: Pattern) -> Callable[[Array, Array], Array]:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    if a.size * b.shape[1] <= 256:  # calling a library takes longer
-        return _sum_of_products(a, b)
+    if a.size * b.shape[1] <= (256 if b.shape[1] > 16 else 4096):
+        return multiplied(a, b)
     # A transposed factor would take a slower library.
     return lax.dot(contiguous(a), b, precision=lax.Precision.HIGHEST)
 

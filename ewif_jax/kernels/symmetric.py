@@ -12,7 +12,15 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
-from ewif_jax.kernels.sparse import Pattern, by_row, elements, full, pattern, terms
+from ewif_jax.kernels.sparse import (
+    Pattern,
+    by_row,
+    elements,
+    full,
+    multiplied,
+    pattern,
+    terms,
+)
 
 
 def order(packed: Array) -> int:
@@ -216,6 +224,8 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
 @kernel
 def _times(packed: Array, x: Array) -> Array:
     full = _spread(packed)
+    if x.ndim == 1:
+        return multiplied(full, x)
     return total(full[:, k] * x[None, k] for k in range(x.shape[0]))
 
 
@@ -245,6 +255,8 @@ def _half(where: Pattern | None) -> Callable[[Array, Array], Array]:
 
 def _left(a: Array, packed: Array, where: Pattern | None) -> Array:
     """a P (m, n)."""
+    if packed.ndim == 1:
+        return multiplied(a, _spread(packed))
     at = places(a.shape[1])
     return total(f[:, None] * packed[at[k]] for f, k in by_row(a, where or full(*a.shape[:2])))
 
@@ -253,9 +265,11 @@ def _moved(a: Array, packed: Array, where: Pattern | None) -> Array:
     """a P a', packed."""
     n, batch = a.shape[0], packed.ndim - 1
     where = where or full(n, n)
-    if batch and a.size == n * n:
+    if batch == 0:
+        return _pick(multiplied(multiplied(a, _spread(packed)), a.T))
+    if a.size == n * n:
         return _shared(a, packed, where)
-    half = stage(_half(where), a, packed, batch=batch) if batch else _left(a, packed, where)
+    half = stage(_half(where), a, packed, batch=batch)
     rows, cols = np.triu_indices(n)
     return total(half[rows, k[cols]] * f[cols] for f, k in by_row(a, where))
 
