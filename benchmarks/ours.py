@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import ewif_jax as ej
 from benchmarks.workloads import L1, L2
@@ -24,12 +25,15 @@ def seen_mean(step, _):
     return step.mean
 
 
-def stream(workload: L1 | L2) -> ej.Measurement:
-    """The workload's measurements; times are shared by the runs where they are in the workload."""
+def stream(workload: L1 | L2, devices: int = 1) -> ej.Measurement:
+    """The workload's measurements, on their devices; times are shared by the runs where they are in
+    the workload."""
     shape = workload.value.shape
+    mesh = Mesh(np.asarray(jax.devices()[:devices]), ("runs",))
+    split = NamedSharding(mesh, PartitionSpec("runs"))
     return ej.Measurement(
         workload.time,
-        jax.device_put(workload.value, jax.devices()[0]),
+        jax.device_put(workload.value, split if devices > 1 else jax.devices()[0]),
         np.zeros(shape[1], np.int32),
         np.ones(shape[1:], bool),
     )
@@ -41,7 +45,7 @@ def kalman_filter(workload: L1, devices: int = 1) -> Filter:
         run_batch,
         ej.kalman(model()),
         {"q": workload.q},
-        stream(workload),
+        stream(workload, devices),
         prior=ej.Gaussian(workload.prior_mean, workload.prior_cov),
         t0=0.0,
         params_per_run=workload.per_run,

@@ -18,6 +18,7 @@ from ewif_jax import checks
 from ewif_jax.estimator import Clock, advance, float_dtype, initial, validated
 from ewif_jax.layout import (
     Frozen,
+    Place,
     broadcast_prefix,
     device_count,
     first_run,
@@ -162,15 +163,15 @@ def _run_batch(
 
     def filtered(*inputs: Any) -> Any:
         runs = inputs[1].value.shape[0]
-        size = group_size(runs, _sizes(estimator, inputs, flags.tree, t0))
+        size = group_size(runs, *_sizes(estimator, inputs, flags.tree, t0))
 
-        def together(inputs: Any) -> Any:
+        def together(inputs: Any, place: Place | None) -> Any:
             inputs, found = (
                 (first_run(inputs, flags.tree), jax.tree.map(lambda _: False, flags.tree))
                 if size == 1
                 else (runs_last(inputs, flags.tree), flags.tree)
             )
-            how = clock, observe or _everything, complete
+            how = clock, observe or _everything, complete, place
             return _scanned(estimator, inputs, found, size, t0, *how)
 
         return in_groups(together, inputs, flags.tree, runs, size)
@@ -182,15 +183,19 @@ def _run_batch(
     return Trace(time, mean, cov, info, state)
 
 
-def _sizes(estimator: Estimator, inputs: Any, flags: Any, t0: Any) -> list[int]:
-    """What each array of the state of one run takes in memory."""
+def _sizes(estimator: Estimator, inputs: Any, flags: Any, t0: Any) -> tuple[int, int]:
+    """The bytes of one run's state, and of the largest array in it or in its estimate."""
 
     def start(inputs: Any) -> Any:
         params, measurements, prior, _, key, _ = first_run(inputs, flags)
-        return initial(estimator, params, prior, t0, measurements.value.dtype, key)
+        state = initial(estimator, params, prior, t0, measurements.value.dtype, key)
+        return state, estimator.estimate(params, state)
 
-    leaves = jax.tree.leaves(jax.eval_shape(start, inputs))
-    return [x.size * x.dtype.itemsize for x in leaves]
+    state, shown = (
+        [x.size * x.dtype.itemsize for x in jax.tree.leaves(tree)]
+        for tree in jax.eval_shape(start, inputs)
+    )
+    return sum(state), max(*state, *shown)
 
 
 def _everything(step: Step, context: Any) -> Step:
@@ -207,6 +212,7 @@ def _scanned(
     clock: Clock,
     observe: Observer,
     complete: bool,
+    place: Place | None,
 ) -> tuple[Any, Any]:
     """Observations (R, T, ...) and final states (R, ...) from inputs with the runs last."""
     params, measurements, prior, times, keys, context = inputs
@@ -250,6 +256,6 @@ def _scanned(
         return runs_adjacent(state, state_f), seen
 
     seen, state = scan_in_blocks(
-        arrive, state, arrivals, lambda seen: runs_first(seen, seen_f, runs)
+        arrive, state, arrivals, lambda seen: runs_first(seen, seen_f, runs), place
     )
     return seen, runs_first(state, state_f, runs)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,21 +99,30 @@ def runs_adjacent(tree: Any, flags: Any) -> Any:
     return jax.tree.map(adjacent, tree, flags)
 
 
+class Place(NamedTuple):
+    """Where a group of runs puts what it shows: whole, arrays (R, numbers of all steps), from row
+    () on."""
+
+    whole: Any
+    row: Array | int
+
+
 def scan_in_blocks(
     step: Callable[[Any, Any], tuple[Any, Any]],
     state: Any,
     arrivals: Any,
     finish: Callable[[Any], Any],
+    place: Place | None,
 ) -> tuple[Any, Any]:
     """`lax.scan` of `step`, and `finish` of what it stacks: `finish` moves the stacked axis from
-    the front to place 1.
+    the front to place 1. Without a place for it the result has one of its own.
 
     The stack is finished a block of steps at a time, while it is in the cache, and put where it
-    belongs.
+    belongs, as long rows: short ones are copied slowly.
     """
     steps = jax.tree.leaves(arrivals)[0].shape[0]
     block = _block(steps)
-    if block == steps:
+    if block == steps and place is None:
         state, seen = lax.scan(step, state, arrivals)
         return finish(seen), state
     arrivals = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), arrivals)
@@ -125,33 +134,46 @@ def scan_in_blocks(
 
     one = jax.tree.map(lambda x: x[0], arrivals)
     shapes = jax.eval_shape(several, state, one)[1]
-    whole = jax.tree.map(lambda x: jnp.zeros((x.shape[0], steps, *x.shape[2:]), x.dtype), shapes)
+    shapes = jax.tree.map(lambda x: x.update(shape=(len(x), steps, *x.shape[2:])), shapes)
+    whole, row = (rows(shapes), 0) if place is None else place
 
     def put(carry: Any, numbered: Any) -> tuple[Any, None]:
         state, whole = carry
         number, arrivals = numbered
         state, seen = several(state, arrivals)
-        whole = jax.tree.map(
-            lambda x, new: lax.dynamic_update_slice_in_dim(x, new, number * block, 1), whole, seen
-        )
-        return (state, whole), None
+
+        def placed(whole: Array, new: Array) -> Array:
+            flat = new.reshape(len(new), -1)
+            return lax.dynamic_update_slice(whole, flat, (row, number * flat.shape[1]))
+
+        return (state, jax.tree.map(placed, whole, seen)), None
 
     (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), arrivals))
-    return whole, state
+    return (unrolled(whole, shapes) if place is None else whole), state
+
+
+def rows(shapes: Any) -> Any:
+    """Zeros for what is to be shown, (R, T, ...), a row for each run."""
+    return jax.tree.map(lambda x: jnp.zeros((x.shape[0], x.size // x.shape[0]), x.dtype), shapes)
+
+
+def unrolled(whole: Any, shapes: Any) -> Any:
+    """What is shown, (R, T, ...), from a row for each run."""
+    return jax.tree.map(lambda x, shape: x.reshape(shape.shape), whole, shapes)
 
 
 def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 48, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 48) + 1) if steps % d == 0)
-    return best if best >= 16 else steps
+    """The largest divisor of `steps` up to 10, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 10) + 1) if steps % d == 0)
+    return best if best >= 5 else steps
 
 
-def group_size(runs: int, state: list[int]) -> int:
-    """How many runs to filter at once, from what each array of one run's state takes in bytes: a
-    divisor of `runs` for which the states stay in the cache and no array is so large that the
-    compiler would have several threads wait for each other at every step; or 1 where that would
+def group_size(runs: int, state: int, largest: int) -> int:
+    """How many runs to filter at once, from the bytes that one run's state and its largest array
+    take: a divisor of `runs` for which the states stay in the cache and no array is so large that
+    the compiler would have several threads wait for each other at every step; or 1 where that would
     leave too few to fill vectors (a state that large is a vector itself)."""
-    room = max(min(_CACHE // max(sum(state), 1), _UNDIVIDED // max(*state, 1)), 1)
+    room = max(min(_CACHE // max(state, 1), _UNDIVIDED // max(largest, 1)), 1)
     best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
     return best if best >= 16 else runs if room >= min(runs, 16) else 1
 
@@ -159,11 +181,17 @@ def group_size(runs: int, state: list[int]) -> int:
 _CACHE, _UNDIVIDED = 2**19, 2**18
 
 
-def in_groups(fn: Callable[[Any], Any], inputs: Any, flags: Any, runs: int, size: int) -> Any:
-    """`fn` of `size` runs at a time: the leading axis of the flagged leaves that go in, and of all
-    that come out."""
+def in_groups(
+    fn: Callable[[Any, Place | None], tuple[Any, Any]],
+    inputs: Any,
+    flags: Any,
+    runs: int,
+    size: int,
+) -> tuple[Any, Any]:
+    """`fn` of `size` runs at a time, the leading axis of the flagged leaves that go in and of all
+    that come out: what is shown, which `fn` puts in its place, and the last states."""
     if size == runs:
-        return fn(inputs)
+        return fn(inputs, None)
     leaves, tree = jax.tree.flatten(inputs)
     marked = jax.tree.leaves(flags)
     groups = runs // size
@@ -171,12 +199,19 @@ def in_groups(fn: Callable[[Any], Any], inputs: Any, flags: Any, runs: int, size
         x.reshape(groups, size, *x.shape[1:]) for x, f in zip(leaves, marked, strict=True) if f
     ]
 
-    def one(group: list[Array]) -> Any:
+    def merged(group: list[Array]) -> Any:
         some = iter(group)
         mixed = [next(some) if f else x for x, f in zip(leaves, marked, strict=True)]
-        return fn(jax.tree.unflatten(tree, mixed))
+        return jax.tree.unflatten(tree, mixed)
 
-    return jax.tree.map(lambda x: x.reshape(runs, *x.shape[2:]), lax.map(one, split))
+    def one(whole: Any, numbered: Any) -> tuple[Any, Any]:
+        number, group = numbered
+        return fn(merged(group), Place(whole, number * size))
+
+    shapes = jax.eval_shape(lambda group: fn(merged(group), None)[0], [x[0] for x in split])
+    shapes = jax.tree.map(lambda x: x.update(shape=(runs, *x.shape[1:])), shapes)
+    whole, last = lax.scan(one, rows(shapes), (jnp.arange(groups), split))
+    return unrolled(whole, shapes), jax.tree.map(lambda x: x.reshape(runs, *x.shape[2:]), last)
 
 
 def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable[..., Any]:

@@ -15,11 +15,8 @@ from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
 from ewif_jax.kernels.sparse import (
     Pattern,
     by_row,
-    elements,
     full,
     multiplied,
-    pattern,
-    terms,
 )
 
 
@@ -79,7 +76,7 @@ def unpack(packed: Array) -> Array:
 def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
     """a P a' for a square matrix a and a packed P, packed; `where` a may differ from zero.
 
-    With a shared by the batch this is one product with a's second power.
+    A dense matrix a that the batch shares is one product with its second power.
     """
     return _congruence(where)(a, packed)
 
@@ -267,44 +264,23 @@ def _moved(a: Array, packed: Array, where: Pattern | None) -> Array:
     where = where or full(n, n)
     if batch == 0:
         return _pick(multiplied(multiplied(a, _spread(packed)), a.T))
-    if a.size == n * n:
-        return _shared(a, packed, where)
+    if a.size == n * n and 2 * sum(map(sum, where)) > n * n:
+        return _shared(a, packed)
     half = stage(_half(where), a, packed, batch=batch)
     rows, cols = np.triu_indices(n)
     return total(half[rows, k[cols]] * f[cols] for f, k in by_row(a, where))
 
 
-def _shared(a: Array, packed: Array, where: Pattern) -> Array:
-    """a P a' with the second power of an a without a batch, as a product or term by term."""
-    columns, _ = terms(_squared(where))
-    size = columns.shape[1]
-    few = 2 * len(columns) < size
-    power = stage(_second_power(where, few), a, batch=packed.ndim - 1)
-    if few:
-        return total(power[:, t] * packed[at] for t, at in enumerate(columns))
-    flat = packed.reshape(size, -1)
-    moved = lax.dot(power.reshape(size, size), flat, precision=lax.Precision.HIGHEST)
+def _shared(a: Array, packed: Array) -> Array:
+    """a P a' as one product with the second power of an a without a batch."""
+    power = stage(_second_power, a, batch=packed.ndim - 1).reshape(len(packed), len(packed))
+    moved = lax.dot(power, packed.reshape(len(packed), -1), precision=lax.Precision.HIGHEST)
     return moved.reshape(packed.shape)
 
 
-@cache
-def _second_power(where: Pattern, few: bool) -> Callable[[Array], Array]:
-    """a -> what each element of P, or few of them, count in each of a P a'."""
-    taken, counts = terms(_squared(where) if few else full(*2 * (len(_squared(where)),)))
-
-    def power(a: Array) -> Array:
-        rows, cols = np.triu_indices(a.shape[0])
-        i, j, k, m = rows[:, None], cols[:, None], rows[taken.T], cols[taken.T]
-        straight = elements(a, i, k, counts.T) * elements(a, j, m, counts.T)
-        return straight + elements(a, i, m, counts.T & (k != m)) * elements(a, j, k, counts.T)
-
-    return power
-
-
-@cache
-def _squared(where: Pattern) -> Pattern:
-    """Which elements of P each element of a P a' takes."""
-    flags = np.asarray(where, bool)
-    rows, cols = np.triu_indices(len(where))
-    straight = flags[np.ix_(rows, rows)] & flags[np.ix_(cols, cols)]
-    return pattern(straight | flags[np.ix_(rows, cols)] & flags[np.ix_(cols, rows)])
+def _second_power(a: Array) -> Array:
+    """What each element of P counts in each element of a P a', both packed."""
+    rows, cols = np.triu_indices(a.shape[0])
+    i, j, k, m = rows[:, None], cols[:, None], rows[None], cols[None]
+    different = jnp.asarray(k != m, a.dtype).reshape(k.shape + (1,) * (a.ndim - 2))
+    return a[i, k] * a[j, m] + different * a[i, m] * a[j, k]

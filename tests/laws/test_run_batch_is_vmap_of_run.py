@@ -68,8 +68,8 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
         time, rng.normal(size=(runs, steps, 2)), np.zeros(steps, int), np.ones((steps, 2), bool)
     )
     q = np.linspace(0.1, 2.0, runs)
-    assert layout.group_size(runs, [8, 8 * 4, 8 * 10]) == (1 if cache == 1 else 16)
-    assert layout._block(steps) == 48
+    assert layout.group_size(runs, 8 * (1 + 4 + 10), 8 * 16) == (1 if cache == 1 else 16)
+    assert layout._block(steps) == 8
     estimator = ej.kalman(MODEL)
     got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
     for k in (0, 17, 31):
