@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
+from ewif_jax.kernels.small import matvec
 from ewif_jax.kernels.sparse import (
     Pattern,
     by_row,
@@ -95,7 +96,7 @@ def rows(a: Array, packed: Array, where: Pattern | None = None) -> Array:
 
 def times(packed: Array, x: Array) -> Array:
     """P x (n,) for a packed P."""
-    return _times(packed, x)
+    return matvec(unpack(packed), x)
 
 
 def diagonal(packed: Array) -> Array:
@@ -216,14 +217,6 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
         return others - reciprocal[None] * left * right
 
     return swept
-
-
-@kernel
-def _times(packed: Array, x: Array) -> Array:
-    full = _spread(packed)
-    if x.ndim == 1:
-        return multiplied(full, x)
-    return total(full[:, k] * x[None, k] for k in range(x.shape[0]))
 
 
 @cache
