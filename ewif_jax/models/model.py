@@ -138,6 +138,7 @@ def flow(model: Model, params: Any, x: Array, t0: Array, t1: Array) -> tuple[Arr
     Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
     if model.linear is not None:
         F, c = affine_flow(model, params, t0, t1, x.dtype)
+        checks.shape("F", F, (x.shape[0],) * 2)
         moved = matvec(F, x, model.linear.F_where)
         return (moved if c is None else moved + c), F, Q
 
@@ -159,6 +160,7 @@ def sight(
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     if model.linear is not None:
         H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
+        checks.shape("H", H, ("m", x.shape[0]))
         return matvec(H, x, model.linear.H_where), H, R
 
     def see(x: Array) -> Array:
