@@ -49,7 +49,6 @@ def covariance_form(
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
         mean, F, Q = flow(model, params, state.mean, state.time, ahead)
-        checks.shape("F", F, (state.mean.shape[0],) * 2)
         known = time >= state.time
         if inflation is None:
             cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
@@ -86,8 +85,6 @@ def measure(
     (delay 0, status USED or REJECTED)."""
     predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    checks.shape("H", H, ("m", mean.shape[0]))
-    checks.shape("R", R, (H.shape[0],) * 2)
     difference = model.residual(measurement.value, predicted, measurement.sensor)
     seen = Compared(difference, H, R, measurement.mask)
     return updated(model, mean, cov, seen, patterns(model)[1])

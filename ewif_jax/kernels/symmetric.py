@@ -13,12 +13,7 @@ from jax import Array, lax
 
 from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
 from ewif_jax.kernels.small import matvec
-from ewif_jax.kernels.sparse import (
-    Pattern,
-    by_row,
-    full,
-    multiplied,
-)
+from ewif_jax.kernels.sparse import Pattern, by_row, full, multiplied
 
 
 def order(packed: Array) -> int:
@@ -171,8 +166,9 @@ def _eliminated(rest: Array, reciprocal: Array) -> Array:
 
 def _weights(row: Array, reciprocal: Array, *later: Array) -> Array:
     """The weights (m,) of an unknown: from its row when it was eliminated, and later weights."""
-    known = row[1 + len(later) :]
-    for factor, weights in zip(row[1:], later, strict=False):
+    end = 1 + len(later)
+    known = row[end:]
+    for factor, weights in zip(row[1:end], later, strict=True):
         known = known - factor[None] * weights
     return known * reciprocal[None]
 

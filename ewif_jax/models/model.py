@@ -145,7 +145,9 @@ def flow(model: Model, params: Any, x: Array, t0: Array, t1: Array) -> tuple[Arr
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    return move(x), jax.jacfwd(move)(x), Q
+    F = jax.jacfwd(move)(x)
+    checks.shape("F", F, (x.shape[0],) * 2)
+    return move(x), F, Q
 
 
 def sight(
@@ -161,12 +163,15 @@ def sight(
     if model.linear is not None:
         H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
         checks.shape("H", H, ("m", x.shape[0]))
+        checks.shape("R", R, (H.shape[0],) * 2)
         return matvec(H, x, model.linear.H_where), H, R
 
     def see(x: Array) -> Array:
         return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
 
-    return see(x), jax.jacfwd(see)(x), R
+    H = jax.jacfwd(see)(x)
+    checks.shape("R", R, (H.shape[0],) * 2)
+    return see(x), H, R
 
 
 def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:

@@ -95,7 +95,6 @@ def asd(model: Model, lag: int) -> Estimator:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
         mean, F, Q = flow(model, params, state.mean, state.time, ahead)
-        checks.shape("F", F, (state.mean.shape[0],) * 2)
         known = time >= state.time
         cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
         mean = jnp.where(known, mean, jnp.nan)

@@ -99,7 +99,6 @@ def late_update(
     dtype = state.mean.dtype
     at = jnp.clip(measurement.time, start.time, state.time)
     predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
-    checks.shape("F", F, (state.mean.shape[0],) * 2)
     F_where, H_where = patterns(model)
     M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)

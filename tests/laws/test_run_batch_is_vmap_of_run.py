@@ -58,6 +58,22 @@ def test_run_batch_is_vmap_of_run(name, shared):
     assert jnp.all(jnp.isfinite(got.mean))
 
 
+@pytest.mark.parametrize("steps", [7, 20], ids=["one_block", "blocks"])
+def test_gradients_go_through_groups_of_runs(steps, monkeypatch):
+    """In reverse mode, with the results of all groups in one array."""
+    rng = np.random.default_rng(6)
+    values, time = rng.normal(size=(32, steps, 2)), np.cumsum(rng.uniform(0.1, 1.0, steps))
+    batch = ej.Measurement(time, values, np.zeros(steps, int), np.ones((steps, 2), bool))
+
+    def loss(q):
+        trace = ej.run_batch(ej.kalman(MODEL), {"q": q}, batch, prior=PRIOR, t0=0.0)
+        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
+
+    together = jax.value_and_grad(loss)(0.7)
+    monkeypatch.setattr(layout, "_CACHE", 16 * 8 * (1 + 4 + 10))
+    np.testing.assert_allclose(jax.value_and_grad(loss)(0.7), together, rtol=1e-10)
+
+
 @pytest.mark.parametrize("cache", [1, 16 * 8 * (1 + 4 + 10)], ids=["one_by_one", "in_groups"])
 def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
     monkeypatch.setattr(layout, "_CACHE", cache)
