@@ -218,9 +218,9 @@ def _is_numeric(value: np.ndarray) -> bool:
 
 
 def _all_finite(value: np.ndarray) -> bool:
-    """One fast pass: False may also mean that the sum overflows."""
+    """One fast pass: False may also mean that the sum of squares overflows."""
     with np.errstate(all="ignore"):
-        return bool(np.isfinite(np.sum(value)))
+        return bool(np.isfinite(np.vdot(value, value)))
 
 
 def _plain(value: np.ndarray) -> Any:

@@ -172,7 +172,10 @@ def group_size(runs: int, state: int, largest: int) -> int:
     """How many runs to filter at once, from the bytes that one run's state and its largest array
     take: a divisor of `runs` for which the states stay in the cache and no array is so large that
     the compiler would have several threads wait for each other at every step; or 1 where that would
-    leave too few to fill vectors (a state that large is a vector itself)."""
+    leave too few to fill vectors (a state that large is a vector itself). What is no CPU takes all
+    runs at once."""
+    if jax.default_backend() != "cpu":
+        return runs
     room = max(min(_CACHE // max(state, 1), _UNDIVIDED // max(largest, 1)), 1)
     best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
     return best if best >= 16 else runs if room >= min(runs, 16) else 1

@@ -77,6 +77,7 @@ def test_gradients_go_through_groups_of_runs(steps, monkeypatch):
 @pytest.mark.parametrize("cache", [1, 16 * 8 * (1 + 4 + 10)], ids=["one_by_one", "in_groups"])
 def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
     monkeypatch.setattr(layout, "_CACHE", cache)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     runs, steps = 32, 96
     rng = np.random.default_rng(5)
     time = np.cumsum(rng.uniform(0.1, 1.0, (runs, steps)), 1)
