@@ -64,8 +64,7 @@ def main() -> None:
         "replay(kalman)": row(ej.replay(ej.kalman(model), lag), noisy, late),
     }
     results = []
-    for name, fn in filters.items():
-        times = measure(fn, options.repeat, budget=20.0)
+    for name, times in measure(filters, options.repeat, budget=20.0).items():
         results.append(
             {"workload": "L2", "name": name, "run_steps": runs * steps, "note": ""} | times
         )

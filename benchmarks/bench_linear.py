@@ -2,8 +2,8 @@
 
 (a) all runs share the process noise, (b) each run has its own. All peers must agree on the
 means. The Numba kernel is compiled once for all its rows: only the first shows the compilation.
-The machine may be shared and its speed may drift: compare the ratios within one table, not the
-figures of two.
+The machine may be shared and its speed may drift: the filters take turns, and the ratios within one
+table are what to compare.
 """
 
 import argparse
@@ -51,8 +51,8 @@ def _measure_all(filters: dict, options: argparse.Namespace) -> list[dict]:
     results = []
     for label, per_run in (("L1a", False), ("L1b", True)):
         workload = constant_acceleration(options.runs, options.steps, per_run=per_run)
-        for name, build in filters.items():
-            times = measure(build(workload), options.repeat, options.budget)
+        calls = {name: build(workload) for name, build in filters.items()}
+        for name, times in measure(calls, options.repeat, options.budget).items():
             row = {
                 "workload": label,
                 "name": name,

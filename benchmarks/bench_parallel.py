@@ -6,6 +6,7 @@ its working space.
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -44,9 +45,9 @@ def main() -> None:
     if options.associative:
         rows["run_parallel associative"] = parallel("associative", options.block or 32)
     results = []
-    for name, fn in rows.items():
-        times = measure(lambda fn=fn: fn(data), options.repeat, options.budget)
-        note = f"{_megabytes(fn, data):.0f} MB"
+    calls = {name: partial(fn, data) for name, fn in rows.items()}
+    for name, times in measure(calls, options.repeat, options.budget).items():
+        note = f"{_megabytes(rows[name], data):.0f} MB"
         row = {"workload": "L3", "name": name, "run_steps": options.steps, "note": note}
         results.append(row | times)
     truth = np.asarray(sequential(data).mean)

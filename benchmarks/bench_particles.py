@@ -202,19 +202,20 @@ def main() -> None:
     work = workload(options.steps)
     filters = {"ewif_jax": ours, "cuthbert": cuthbert_filter, "particles": particles_filter}
     results, means = [], {}
-    for name in ("ewif_jax", *options.peers):
-        call = filters[name](work, options.particles)
-        times = measure(call, options.repeat, options.budget)
-        means[name] = np.asarray(call())
+    names = ("ewif_jax", *options.peers)
+    calls = {name: filters[name](work, options.particles) for name in names}
+    for name, times in measure(calls, options.repeat, options.budget).items():
+        means[name] = np.asarray(calls[name]())
         results.append({"workload": "N1", "name": name, "run_steps": options.steps} | times)
     for row in results:
         apart = (means[row["name"]] - means["ewif_jax"]) / deviations(work, options.particles)
         row["apart_in_standard_deviations"] = float(np.sqrt(np.mean(apart**2)))
         assert row["apart_in_standard_deviations"] < 0.3, row
-    for name, (in_sequence, old) in late(work, options.particles).items():
-        for label, call in (("in sequence", in_sequence), ("late", old)):
-            row = {"workload": label, "name": name, "run_steps": 1}
-            results.append(row | measure(call, 3 * options.repeat, options.budget))
+    pairs = late(work, options.particles)
+    for k, label in enumerate(("in sequence", "late")):
+        calls = {name: pair[k] for name, pair in pairs.items()}
+        for name, times in measure(calls, 3 * options.repeat, options.budget).items():
+            results.append({"workload": label, "name": name, "run_steps": 1} | times)
     report(results, options.output, references=("cuthbert", "particles", "bootstrap"))
 
 

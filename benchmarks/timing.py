@@ -4,7 +4,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -28,30 +28,42 @@ PACKAGES = (
 )
 
 
-def measure(fn: Callable[[], object], repeat: int = 7, budget: float | None = None) -> dict:
-    """Seconds of the first call of `fn` (compile and run) and quartiles of the later ones.
+def measure(
+    calls: Mapping[str, Callable[[], object]], repeat: int = 7, budget: float | None = None
+) -> dict[str, dict]:
+    """Seconds of the first call of each function (compile and run), and of later ones.
+
+    The later calls take turns, since the speed of a machine that is shared drifts by more than the
+    differences between filters: what is compared was measured at the same time.
 
     Args:
-        fn: Takes nothing and returns a pytree of arrays, which is waited for.
-        repeat: How many later calls to time.
-        budget: Start no further call once the later calls took this many seconds together; at
-            least one is timed.
+        calls: Functions of no arguments, by name, each returning a pytree of arrays, which is
+            waited for.
+        repeat: How many rounds of later calls.
+        budget: Call a function no more once its later calls took this many seconds together; one
+            is always timed.
 
     Returns:
-        ``first_s``, ``median_s``, ``lower_quartile_s``, ``upper_quartile_s``, ``repeat`` (the
-        later calls timed).
+        For each name ``first_s``, ``later_s`` (a list, in order), ``median_s``,
+        ``lower_quartile_s``, ``upper_quartile_s``.
     """
-    first = _seconds(fn)
-    later: list[float] = []
-    while len(later) < max(repeat, 1) and (not later or budget is None or sum(later) < budget):
-        later.append(_seconds(fn))
+    first = {name: _seconds(fn) for name, fn in calls.items()}
+    later: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(max(repeat, 1)):
+        for name, fn in calls.items():
+            if not later[name] or budget is None or sum(later[name]) < budget:
+                later[name].append(_seconds(fn))
+    return {name: _summary(first[name], later[name]) for name in calls}
+
+
+def _summary(first: float, later: list[float]) -> dict:
     lower, median, upper = np.quantile(later, [0.25, 0.5, 0.75])
     return {
         "first_s": first,
+        "later_s": later,
         "median_s": float(median),
         "lower_quartile_s": float(lower),
         "upper_quartile_s": float(upper),
-        "repeat": len(later),
     }
 
 
@@ -65,20 +77,27 @@ def report(
             steps of all runs that one call filters) and optionally ``note`` added.
         path: Where the JSON goes; missing folders are made.
         references: Names of results; the table shows the speed of each result relative to each
-            of them within the same workload.
+            of them within the same workload, as the median of the ratios within a round.
     """
     rows = [dict(row, run_steps_per_s=row["run_steps"] / row["median_s"]) for row in results]
-    speed = {(row["workload"], row["name"]): row["run_steps_per_s"] for row in rows}
+    found = {(row["workload"], row["name"]): row for row in rows}
     for row in rows:
         row["speed_relative_to"] = {
-            name: row["run_steps_per_s"] / speed[row["workload"], name]
+            name: _ratio(row, found[row["workload"], name])
             for name in references
-            if (row["workload"], name) in speed
+            if (row["workload"], name) in found
         }
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"environment": environment(), "results": rows}, indent=2) + "\n")
     print(_table(rows, references))
+
+
+def _ratio(row: dict, reference: dict) -> float:
+    """The speed of one relative to the other: the median over the rounds that both were in."""
+    rounds = zip(row["later_s"], reference["later_s"], strict=False)
+    quicker = float(np.median([theirs / ours for ours, theirs in rounds]))
+    return quicker * row["run_steps"] / reference["run_steps"]
 
 
 def environment() -> dict:
