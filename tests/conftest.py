@@ -14,9 +14,11 @@ import jaxlib.version
 import pytest
 from hypothesis import Phase, settings
 
+sys.path.insert(0, str(Path(__file__).parent))
+from apart import FLAGS_OF_THE_TESTS
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-sys.path.insert(0, str(Path(__file__).parent))
 
 settings.register_profile(
     "few",
@@ -64,8 +66,10 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     if not config.getoption("--all") and jaxlib.version.__version_info__ < (0, 11):
         # Compiling takes most of the time. A later XLA might not know the flags, and stop.
-        flags = (os.environ.get("XLA_FLAGS", ""), *QUICK_TO_COMPILE)
-        os.environ["XLA_FLAGS"] = " ".join(flags).strip()
+        added = " " + " ".join(QUICK_TO_COMPILE)
+        if FLAGS_OF_THE_TESTS not in os.environ:  # the workers of xdist inherit them
+            os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + added
+            os.environ[FLAGS_OF_THE_TESTS] = added
     config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
 
 

@@ -79,15 +79,25 @@ def covariance_form(
 
 
 def measure(
-    model: Model, params: Any, mean: Array, cov: Array, measurement: Measurement
+    model: Model, params: Any, mean: Array, cov: Array, measurement: Measurement, still: int = 0
 ) -> tuple[Array, Array, Info]:
     """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
-    (delay 0, status USED or REJECTED)."""
-    predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
+    (delay 0, status USED or REJECTED). The last `still` components of the state are not the
+    model's, which neither moves nor sees them."""
+    moving = mean[: mean.shape[0] - still]
+    predicted, H, R = sight(model, params, moving, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     difference = model.residual(measurement.value, predicted, measurement.sensor)
-    seen = Compared(difference, H, R, measurement.mask)
-    return updated(model, mean, cov, seen, patterns(model)[1])
+    seen = Compared(difference, unseen(H, still), R, measurement.mask)
+    where = patterns(model)[1]
+    if where is not None:
+        where = tuple(row + (False,) * still for row in where)
+    return updated(model, mean, cov, seen, where)
+
+
+def unseen(H: Array, still: int) -> Array:
+    """H (m, n) of a state with as many more components."""
+    return jnp.pad(H, ((0, 0), (0, still))) if still else H
 
 
 def _inflated(cov: Array, factor: Array) -> Array:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.scipy.linalg import block_diag
 
 from ewif_jax.estimator import choose
 from ewif_jax.forms.covariance import CovarianceState
@@ -40,10 +41,11 @@ def fixed_point(
         p(x_\tau | x_k, y_{0:k-1}) = N(\hat x_\tau + G (x_k - \hat x_k),\;
             P_{\tau\tau} - G P_{k\tau}), \quad G = P_{\tau k} P_{kk}^{-1}
 
-    (43)-(46) of Orguner & Gustafsson: the filter of the augmented state (36)-(38) from `start`, the
-    last summary not newer than tau, through the measurements after tau, and on to `now`; there x_k
-    is a measurement, through (24), of the state at the last of these times (tau itself if nothing
-    was measured since). One gain serves every x_k. Exact for a linear model.
+    (43)-(46) of Orguner & Gustafsson: the filter of the augmented state (36)-(38), whose second
+    half stands still and is never seen, from `start`, the last summary not newer than tau, through
+    the measurements after tau, and on to `now`; there x_k is a measurement, through (24), of the
+    state at the last of these times (tau itself if nothing was measured since). One gain serves
+    every x_k. Exact for a linear model.
 
     Args:
         points: of the unscented transform (UKS), or None: linearised (EKS).
@@ -53,11 +55,15 @@ def fixed_point(
     Deviations: Remark 2 prints x(k-1) for x(tau) in (44), which is not the posterior.
     """
     n = start.mean.shape[0]
-    both = _augmented(model, n)
 
-    def ahead(model: Model, state: CovarianceState, time: Array) -> CovarianceState:
-        mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, time)
-        return CovarianceState(time, mean, symmetric.congruence(F, state.cov) + symmetric.pack(Q))
+    def ahead(state: CovarianceState, time: Array, still: int) -> CovarianceState:
+        """All but the last `still` components."""
+        mean, cov = state.mean, state.cov
+        moved, F, Q = flow_around(model, points, params, mean, cov, state.time, time, still)
+        F = block_diag(F, jnp.eye(still, dtype=F.dtype))
+        Q = jnp.pad(Q, (0, still))
+        mean = jnp.concatenate([moved, mean[n:]])
+        return CovarianceState(time, mean, symmetric.congruence(F, cov) + symmetric.pack(Q))
 
     def one(
         state: CovarianceState, step: tuple[Measurement, Array]
@@ -66,12 +72,12 @@ def fixed_point(
         inside = (measurement.time > tau) & (measurement.time < now)
         inside = inside & jnp.any(measurement.mask) & ~last
         time = jnp.where(last, now, jnp.where(inside, measurement.time, state.time))
-        moved = ahead(both, state, time)
-        mean, cov, _ = measure_around(both, points, params, moved.mean, moved.cov, measurement)
+        moved = ahead(state, time, n)
+        mean, cov, _ = measure_around(model, points, params, moved.mean, moved.cov, measurement, n)
         measured = choose(inside, CovarianceState(time, mean, cov), state)
         return choose(last, moved, measured), None
 
-    there = ahead(model, start, tau)
+    there = ahead(start, tau, 0)
     twice = jnp.tile(symmetric.unpack(there.cov), (2, 2))
     first = CovarianceState(tau, jnp.tile(there.mean, 2), symmetric.pack(twice))
     # After the measurements once more, only to move on: a second copy would be compiled longer.
@@ -89,22 +95,3 @@ def given(conditional: Conditional, x: Array) -> Gaussian:
     """The mean (n,) and covariance (n, n) of x(tau) if the state now is x (n,)."""
     mean, gain, now, cov = conditional
     return Gaussian(mean + matvec(gain, x - now), cov)
-
-
-def _augmented(model: Model, n: int) -> Model:
-    """The model of a state (2n,) whose second half stands still and is never seen (36), (37)."""
-
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
-        moved = jnp.asarray(model.transition(params, x[:n], t0, t1), x.dtype)
-        return jnp.concatenate([moved, x[n:]])
-
-    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
-        Q = jnp.asarray(model.process_cov(params, t0, t1))
-        return jnp.zeros((2 * n, 2 * n), Q.dtype).at[:n, :n].set(Q)
-
-    def observe(params: Any, x: Array, sensor: Array, t: Array) -> Array:
-        return model.observe(params, x[:n], sensor, t)
-
-    return model._replace(
-        transition=transition, process_cov=process_cov, observe=observe, linear=None
-    )

@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import choose
-from ewif_jax.forms.covariance import measure
+from ewif_jax.forms.covariance import measure, unseen
 from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import cholesky, sigma_points, symmetric
 from ewif_jax.models.model import Model, flow, resolve
@@ -77,15 +77,17 @@ def flow_around(
     cov: Array,
     t0: Array,
     t1: Array,
+    still: int = 0,
 ) -> tuple[Array, Array, Array]:
-    """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0."""
+    """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0: of
+    all but the last `still` components, which do not move."""
     if points is None:
-        return flow(model, params, mean, t0, t1)
+        return flow(model, params, mean[: mean.shape[0] - still], t0, t1)
 
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    moved, F, left_over = _regressed(move, lambda x, y: x - y, points, params, mean, cov)
+    moved, F, left_over = _regressed(move, lambda x, y: x - y, points, params, mean, cov, still)
     return moved, F, left_over + jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
 
 
@@ -96,22 +98,23 @@ def measure_around(
     mean: Array,
     cov: Array,
     measurement: Measurement,
+    still: int = 0,
 ) -> tuple[Array, Array, Info]:
-    """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
-    (delay 0, status USED or REJECTED)."""
+    """`forms.covariance.measure` with the measurement's moments by `points`."""
     if points is None:
-        return measure(model, params, mean, cov, measurement)
+        return measure(model, params, mean, cov, measurement, still)
     sensor = measurement.sensor
-    see, R = view(model, params, sensor, measurement.time, mean)
+    moving = mean[: mean.shape[0] - still]
+    see, R = view(model, params, sensor, measurement.time, moving)
 
     def apart(x: Array, y: Array) -> Array:
         return model.residual(x, y, sensor)
 
-    predicted, H, left_over = _regressed(see, apart, points, params, mean, cov)
+    predicted, H, left_over = _regressed(see, apart, points, params, mean, cov, still)
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
     difference = apart(measurement.value, predicted)
-    seen = Compared(difference, H, R + left_over, measurement.mask)
+    seen = Compared(difference, unseen(H, still), R + left_over, measurement.mask)
     return updated(model, mean, cov, seen)
 
 
@@ -122,12 +125,18 @@ def _regressed(
     params: Any,
     mean: Array,
     cov: Array,
+    still: int,
 ) -> tuple[Array, Array, Array]:
-    """Mean, slope and left-over covariance of f of a Gaussian. Values are compared through `apart`
-    with the one at the mean, so that angles on both sides of a cut have a mean. NaN, without
-    harm to gradients, where a value is not a number."""
+    """Mean, slope and left-over covariance of f of all but the last `still` components of a
+    Gaussian. Values are compared through `apart` with the one at the mean, so that angles on both
+    sides of a cut have a mean. NaN, without harm to gradients, where a value is not a number.
+
+    The points that are moved along a column of the other components have f of the mean: they spread
+    the rest, and each adds to what is left over as the central point does."""
     scale, centre = transform(points, params, mean.shape[0], mean.dtype)
-    root = cholesky.factor(symmetric.unpack(cov))
+    centre = centre + still / scale
+    n = mean.shape[0] - still
+    mean, root = mean[:n], cholesky.factor(symmetric.unpack(cov)[:n, :n])
     around = mean[:, None] + sigma_points.offsets(root.lower, scale)
     middle = f(mean)
 

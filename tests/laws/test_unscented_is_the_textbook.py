@@ -1,5 +1,7 @@
 """The unscented filter and smoother equal a loop over points, angles and refusals included."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ from oracles.unscented import unscented_smoother
 
 import ewif_jax as ej
 from ewif_jax.estimators.unscented import unscented
+from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around
+from ewif_jax.kernels import symmetric
 from ewif_jax.models import bearing_sensor, constant_velocity, position_sensor
 from ewif_jax.smoothers.rts import rts
 
@@ -139,3 +143,37 @@ def test_bad_settings_are_named(settings, name):
 def test_an_unknown_smoother_is_refused():
     with pytest.raises(ValueError, match=r"form: expected one of .*'particle'"):
         rts(MODEL, PARAMS, STREAM, prior=PRIOR, t0=0.0, form="particle")
+
+
+def beside_what_stands_still(model):
+    """The model of a state (2n,) whose second half neither moves nor is seen."""
+
+    def transition(params, x, t0, t1):
+        return jnp.concatenate([model.transition(params, x[:4], t0, t1), x[4:]])
+
+    def process_cov(params, t0, t1):
+        return jnp.pad(model.process_cov(params, t0, t1), (0, 4))
+
+    def observe(params, x, sensor, t):
+        return model.observe(params, x[:4], sensor, t)
+
+    return model._replace(transition=transition, process_cov=process_cov, observe=observe)
+
+
+@pytest.mark.parametrize("points", [SigmaPoints(), SigmaPoints(0.7, 2.0, 1.0), None])
+def test_no_points_are_needed_for_what_stands_still(points):
+    """Moments of the half that moves are those of all 4n points of the whole."""
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(8, 8))
+    mean, cov = jnp.asarray(rng.normal(size=8)), symmetric.pack(jnp.asarray(root @ root.T))
+    whole = beside_what_stands_still(MODEL)
+    moved, F, Q = flow_around(MODEL, points, PARAMS, mean, cov, 0.3, 1.5, 4)
+    moved_8, F_8, Q_8 = flow_around(whole, points, PARAMS, mean, cov, 0.3, 1.5)
+    np.testing.assert_allclose(moved, moved_8[:4], rtol=1e-10)
+    np.testing.assert_allclose(np.kron([[1, 0], [0, 0]], F) + np.diag([0.0] * 4 + [1] * 4), F_8,
+                               rtol=1e-9, atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(np.kron([[1, 0], [0, 0]], Q), Q_8, rtol=1e-9, atol=1e-9)
+    seen = jax.tree.map(lambda x: x[0], STREAM)
+    found = measure_around(MODEL, points, PARAMS, mean, cov, seen, 4)
+    wanted = measure_around(whole, points, PARAMS, mean, cov, seen)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), found, wanted)

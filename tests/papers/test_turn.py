@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from apart import apart
 
 from ewif_jax.analysis.storage import storage
 from ewif_jax.study import turn as study
@@ -10,8 +11,8 @@ from ewif_jax.study import turn_runs as runs_of
 from ewif_jax.study.claims import ratio
 from ewif_jax.study.late import mean_of, rmse
 
-RUNS = 24
-FEW = {runs_of.PS: 12, runs_of.EXACT: 3}
+RUNS = 16
+FEW = {runs_of.PS: 8, runs_of.EXACT: 3}
 """what takes long is given fewer of the runs"""
 REFERENCE = {
     runs_of.STD: ((98.0, 2.5), (26.8, 0.4)),
@@ -25,13 +26,9 @@ REFERENCE = {
 SMOOTHED = (runs_of.EKS, runs_of.UKS, runs_of.PS)
 
 
-@pytest.fixture(scope="module")
-def batches():
-    return runs_of.simulated(jax.random.key(7), RUNS)
-
-
-@pytest.fixture(scope="module")
-def found(batches):
+def computed():
+    """What every method finds, and the bounds."""
+    batches = runs_of.simulated(jax.random.key(7), RUNS)
     own = jax.random.split(jax.random.key(8), RUNS)
 
     def followed(name, method):
@@ -39,12 +36,23 @@ def found(batches):
         some = jax.tree.map(lambda x: x[:runs], batches[method.in_order])
         return runs_of.followed(method, some, own[:runs])
 
-    return {name: followed(name, method) for name, method in runs_of.methods(10_000).items()}
+    found = {name: followed(name, method) for name, method in runs_of.methods(10_000).items()}
+    return found, runs_of.bounds(batches[False])
 
 
 @pytest.fixture(scope="module")
-def bound(batches):
-    return runs_of.bounds(batches[False])
+def results():
+    return apart(computed)
+
+
+@pytest.fixture(scope="module")
+def found(results):
+    return results[0]
+
+
+@pytest.fixture(scope="module")
+def bound(results):
+    return results[1]
 
 
 @pytest.fixture(scope="module")

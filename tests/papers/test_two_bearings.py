@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from apart import apart
 
 from ewif_jax.study import two_bearings as study
 from ewif_jax.study import two_bearings_runs as runs_of
@@ -24,26 +25,38 @@ LOST = {runs_of.PF: (0.07, 0.23, 0.60), runs_of.HALF: (0.22, 0.51, 0.79)}
 particles"""
 
 
-@pytest.fixture(scope="module")
-def world():
-    return runs_of.simulated(jax.random.key(2), 60)
-
-
-@pytest.fixture(scope="module")
-def found(world):
+def computed():
+    """The times of a world (D, T), what every method finds in it, and its bounds."""
+    world = runs_of.simulated(jax.random.key(2), 40)
     every = runs_of.methods(10_000)
-    return {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
+    found = {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
+    return world.times, found, runs_of.bounds(world)
 
 
 @pytest.fixture(scope="module")
-def off(world, found):
+def results():
+    return apart(computed)
+
+
+@pytest.fixture(scope="module")
+def times(results):
+    return results[0]
+
+
+@pytest.fixture(scope="module")
+def found(results):
+    return results[1]
+
+
+@pytest.fixture(scope="module")
+def bound(results):
+    return results[2]
+
+
+@pytest.fixture(scope="module")
+def off(times, found):
     """Mean squared errors (D, R)."""
-    return {name: study.squared(one["error"], world.times) for name, one in found.items()}
-
-
-@pytest.fixture(scope="module")
-def bound(world):
-    return runs_of.bounds(world)
+    return {name: study.squared(one["error"], times) for name, one in found.items()}
 
 
 @pytest.mark.parametrize("name", REFERENCE)
@@ -53,21 +66,21 @@ def test_errors_are_those_of_an_independent_computation(off, name):
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, error)
 
 
-def test_no_filter_is_below_the_bound_and_exact_replay_reaches_it(world, found, off, bound):
-    floor = study.reported(bound["right"], world.times)
+def test_no_filter_is_below_the_bound_and_exact_replay_reaches_it(times, found, off, bound):
+    floor = study.reported(bound["right"], times)
     for delay, value in enumerate(BOUND):
         ours = mean_of(floor[delay])
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, 0.04 * value)
         exact = ratio(off[runs_of.EXACT][delay], study.squared(
-            np.sqrt(bound["right"]), world.times)[delay])  # fmt: skip
+            np.sqrt(bound["right"]), times)[delay])  # fmt: skip
         assert abs(exact.value - 1) < 3 * exact.error + 0.05
-    sd = study.reported(found[runs_of.EXACT]["variance"], world.times)
+    sd = study.reported(found[runs_of.EXACT]["variance"], times)
     np.testing.assert_allclose(sd.mean(1), floor.mean(1), rtol=0.05)
 
 
-def test_the_published_bound_is_not_one(world, found, bound):
-    printed = study.reported(bound["published"], world.times)
-    reported = study.reported(found[runs_of.EKF]["variance"], world.times)
+def test_the_published_bound_is_not_one(times, found, bound):
+    printed = study.reported(bound["published"], times)
+    reported = study.reported(found[runs_of.EKF]["variance"], times)
     for delay in (FIVE, TEN):
         assert printed[delay].mean() > 1.5 * reported[delay].mean()
 
@@ -130,9 +143,9 @@ def test_one_sensor_alone_loses_the_target(found):
         assert (gone.mean(1) > 0.7).all()
 
 
-def test_the_claims(world, found, bound):
+def test_the_claims(times, found, bound):
     """Each is decided by so few runs, but for one that hangs on 2 or 3 %."""
-    rows = {row["claim"]: row for row in study.claims(found, bound, world.times)}
+    rows = {row["claim"]: row for row in study.claims(found, bound, times)}
     holds = {name: row["holds"] for name, row in rows.items()}
     assert len(rows) == 17
     assert holds.pop("EKF (Al1) over EnKF2 at 10 s (RMSE ratio)") != "no"

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from apart import apart
 
 import ewif_jax as ej
 from ewif_jax.scenarios import arrowhead, random_walk, random_walk_model
@@ -25,8 +26,7 @@ HEAD = {0: 55.28, 2: 53.40, 3: 52.41, 4: 51.82, heads.stale(): 51.34, 8: 51.33, 
 """independently computed, standard errors up to 0.13"""
 
 
-@pytest.fixture(scope="module")
-def walk():
+def walked():
     """Mean squared errors (V, 3, R) at the multiples of T_d, and of the exact estimate (3, R)."""
     runs, cases = 16, CASES
     batches = [
@@ -53,6 +53,11 @@ def walk():
         exact.append(exact_late(model, random_walk(), one, window, effort=1_000_000))
     assert found["too_late"][-1].max() == 0
     return found["squared_error"].reshape(-1, len(cases), runs), np.stack(exact)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return apart(walked)
 
 
 @pytest.fixture(scope="module")
