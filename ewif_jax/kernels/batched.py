@@ -19,7 +19,7 @@ from jax import Array
 from jax.core import ShapedArray
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 Function = Callable[..., Any]
@@ -101,22 +101,26 @@ def _jitted(fn: Function) -> Function:
 
 
 @cache
-def _outputs(fn: Function, avals: tuple[tuple[tuple[int, ...], Any], ...]) -> Sequence[Any]:
-    shapes = jax.eval_shape(_flat(fn), *(jax.ShapeDtypeStruct(*aval) for aval in avals))
-    return [ShapedArray(x.shape, x.dtype) for x in shapes]
+def _traced(fn: Function, avals: tuple[tuple[tuple[int, ...], Any], ...]) -> ClosedJaxpr:
+    """`fn` traced, once: the same few kernels come again and again in one program."""
+    return jax.make_jaxpr(_flat(fn))(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
+
+
+def _known(fn: Function, args: Sequence[Any]) -> ClosedJaxpr:
+    return _traced(fn, tuple((x.shape, x.dtype) for x in args))
 
 
 def _abstract(*avals: Any, fn: Function, batch: int) -> Sequence[Any]:
-    return _outputs(fn, tuple((x.shape, x.dtype) for x in avals))
+    return [ShapedArray(x.shape, x.dtype) for x in _known(fn, avals).out_avals]
 
 
 def _inline(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
-    return _flat(fn)(*args)
+    return jaxpr_as_fun(_known(fn, args))(*args)
 
 
 def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
     if fn in _CHEAP or (batch == 0 and fn not in _APART):
-        return _flat(fn)(*args)
+        return _inline(*args, fn=fn, batch=batch)
     with set_xla_metadata(inlineable="false"):
         return _jitted(fn)(*args)
 
