@@ -44,7 +44,15 @@ if platform.machine() in ("x86_64", "AMD64"):
     )
 """About a quarter of the time that XLA takes by default, for programs that mostly run once."""
 
-LONGEST = ("test_tuning", "test_notebooks", "test_float32", "test_pcrlb", "test_late_studies")
+LONGEST = (
+    "test_tuning",
+    "test_notebooks",
+    "test_float32",
+    "test_pcrlb",
+    "test_late_studies",
+    "test_turn",
+    "test_two_bearings",
+)
 MAPS = Path("/proc/self/maps")
 _tests = itertools.count(1)
 
