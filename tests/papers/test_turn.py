@@ -11,8 +11,8 @@ from ewif_jax.study import turn_runs as runs_of
 from ewif_jax.study.claims import ratio
 from ewif_jax.study.late import mean_of, rmse
 
-RUNS = 16
-FEW = {runs_of.PS: 8, runs_of.EXACT: 3}
+RUNS = 24
+FEW = {runs_of.PS: 12, runs_of.EXACT: 3}
 """what takes long is given fewer of the runs"""
 REFERENCE = {
     runs_of.STD: ((98.0, 2.5), (26.8, 0.4)),

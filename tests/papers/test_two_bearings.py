@@ -27,7 +27,7 @@ particles"""
 
 def computed():
     """The times of a world (D, T), what every method finds in it, and its bounds."""
-    world = runs_of.simulated(jax.random.key(2), 40)
+    world = runs_of.simulated(jax.random.key(2), 60)
     every = runs_of.methods(10_000)
     found = {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
     return world.times, found, runs_of.bounds(world)
