@@ -27,6 +27,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=7)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
+    ej.prepare_cpu(1)
     workload = constant_acceleration(options.runs, options.steps)
     sensor = ej.models.position_sensor(lambda p: p["r"], dims=2)
     model = ej.models.constant_acceleration(sensors=sensor, q=lambda p: p["q"], dims=2)

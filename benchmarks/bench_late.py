@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
+    ej.prepare_cpu(1)
     runs = options.runs or (64 if options.quick else 1024)
     steps = options.steps or (100 if options.quick else 1000)
     late = irregular_and_late(runs, steps)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 
+import ewif_jax as ej
 from benchmarks import ours
 from benchmarks.peers import NOTES, PEERS, SPLIT_PEERS, TIMED_RUNS, check
 from benchmarks.timing import measure, report
@@ -23,8 +24,10 @@ OUTPUT = Path(__file__).parent / "results" / "linear.json"
 def main() -> None:
     """Time the peers, check that they agree, print the table and write the JSON."""
     options = _options()
-    if options.devices > 1:
-        jax.config.update("jax_num_cpu_devices", options.devices)  # before JAX starts
+    if options.unprepared:
+        jax.config.update("jax_num_cpu_devices", options.devices)
+    else:
+        ej.prepare_cpu(options.devices)
     filters = _filters(options.peers, options.devices)
     results = _measure_all(filters, options)
     errors = check(filters)  # afterwards, so that first calls are timed with nothing compiled
@@ -71,6 +74,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--repeat", type=int, help="later calls to time: 9, or 3 with --quick")
     parser.add_argument("--budget", type=float, default=10.0, help="seconds for them, each row")
     parser.add_argument("--devices", type=int, default=1, help="JAX host devices")
+    parser.add_argument("--unprepared", action="store_true", help="without `prepare_cpu`")
     parser.add_argument("--peers", nargs="+", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--references", nargs="*", default=["dynamax", "numba 1 thread"])
     parser.add_argument("--output", type=Path, default=OUTPUT, help="JSON file")

@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.timing import measure, report
 from benchmarks.workloads import long_series
+from ewif_jax.compiling import prepare_cpu
 from ewif_jax.estimator import run, stream
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.models import constant_acceleration, position_sensor
@@ -27,6 +28,8 @@ TAU = 2.0
 def main() -> None:
     """Time both, check that they agree, print the table and write the JSON."""
     options = _options()
+    if not options.unprepared:
+        prepare_cpu(1)
     jax.config.update("jax_enable_x64", True)
     series = long_series(options.steps)
     model = constant_acceleration(sensors=position_sensor(float(series.R[0, 0])))
@@ -73,6 +76,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--repeat", type=int, default=5, help="later calls to time")
     parser.add_argument("--budget", type=float, default=30.0, help="seconds for them, each row")
     parser.add_argument("--associative", action="store_true", help="also the prefix sum")
+    parser.add_argument("--unprepared", action="store_true", help="without `prepare_cpu`")
     parser.add_argument("--output", type=Path, default=OUTPUT, help="JSON file")
     return parser.parse_args()
 

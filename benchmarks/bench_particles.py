@@ -199,6 +199,7 @@ def late(work: N1, particles: int) -> dict[str, tuple[Callable[[], object], Call
 def main() -> None:
     """Time the filters, check that they agree, print the table and write the JSON."""
     options = _options()
+    ej.prepare_cpu(1)
     work = workload(options.steps)
     filters = {"ewif_jax": ours, "cuthbert": cuthbert_filter, "particles": particles_filter}
     results, means = [], {}

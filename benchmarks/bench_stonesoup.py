@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
+    ej.prepare_cpu(1)
     runs = options.runs or (64 if options.quick else 512)
     steps = options.steps or (100 if options.quick else 500)
     jax.config.update("jax_enable_x64", True)

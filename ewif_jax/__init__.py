@@ -32,6 +32,7 @@ from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
 from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
 from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
+from ewif_jax.compiling import prepare_cpu
 from ewif_jax.continuous.error import actual_error_continuous, error_bounds_continuous
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
 from ewif_jax.estimator import run, step, stream
@@ -156,6 +157,7 @@ __all__ = [
     "pf_retrodict",
     "positive",
     "prediction_loss",
+    "prepare_cpu",
     "psd",
     "random_walk_cutoff",
     "random_walk_gain",

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jax.errors import JaxRuntimeError
 
+from ewif_jax import checks
+
 QUICK: Mapping[str, Any] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": os.cpu_count() or 1,
@@ -19,6 +21,41 @@ speed. A program is cut into no more parts than can be compiled at the same time
 
 QUICKEST: Mapping[str, Any] = {**QUICK, "xla_backend_optimization_level": 0}
 """Half of that or less. Small arrays take up to 3 times as long, long ones up to 10 times."""
+
+
+_WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1500000"
+
+
+def prepare_cpu(devices: int | None = None) -> None:
+    """Makes this process fast at filtering on a CPU. An application's choice, for it to call before
+    anything is computed: importing `ewif_jax` changes no setting.
+
+    * Loops over small arrays are compiled as one function each. Otherwise XLA calls one function
+      for every operation, which takes longer than the operation where a single series or up to a
+      few hundred runs are filtered: such filters become 1.3 to 20 times faster. (This is an option
+      in the environment variable ``XLA_FLAGS``, unless that sets such options already.)
+    * Every core is a device, over which batches spread their runs.
+
+    Args:
+        devices: how many devices (default: one for each core).
+
+    Raises:
+        RuntimeError: JAX has computed something already.
+        ValueError: `devices` is not a whole number >= 1.
+    """
+    count = _cores() if devices is None else checks.whole("devices", devices, 1)
+    flags = os.environ.get("XLA_FLAGS", "")
+    chosen = "--xla_backend_extra_options" in flags
+    if chosen and jax.config.values.get("jax_num_cpu_devices") == count:
+        return  # a notebook's first cell may run again
+    jax.config.update("jax_num_cpu_devices", count)
+    if not chosen:
+        os.environ["XLA_FLAGS"] = f"{flags} {_WHOLE_LOOPS}".strip()
+
+
+def _cores() -> int:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return cores or 1
 
 
 def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str, Any]) -> Any:

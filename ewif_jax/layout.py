@@ -163,8 +163,8 @@ def unrolled(whole: Any, shapes: Any) -> Any:
 
 
 def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 10, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 10) + 1) if steps % d == 0)
+    """The largest divisor of `steps` up to 20, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 20) + 1) if steps % d == 0)
     return best if best >= 5 else steps
 
 

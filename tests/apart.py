@@ -9,6 +9,8 @@ from unittest.mock import patch
 
 import jax
 
+import ewif_jax as ej
+
 FLAGS_OF_THE_TESTS = "EWIF_JAX_TESTS_XLA_FLAGS"
 """What `conftest` added to XLA_FLAGS, for this to leave it out."""
 
@@ -25,6 +27,7 @@ def apart(fn: Callable[..., Any], *args: Any) -> Any:
 
 
 def _strict() -> None:
+    ej.prepare_cpu(1)
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
 

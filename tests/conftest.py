@@ -33,7 +33,11 @@ settings.load_profile("few")
 gc.freeze()
 gc.set_threshold(50_000, 20, 100)  # tracing keeps most of what it makes
 
-QUICK_TO_COMPILE = ("--xla_cpu_use_fusion_emitters=false",)
+QUICK_TO_COMPILE = (
+    "--xla_cpu_use_fusion_emitters=false",
+    # A loop is one function, not one for each operation in it.
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1500000",
+)
 if platform.machine() in ("x86_64", "AMD64"):
     QUICK_TO_COMPILE += (
         "--xla_backend_optimization_level=0",

@@ -14,7 +14,8 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 RANKS = (
     {"types"},
-    {"checks", "compiling", "kernels"},
+    {"checks"},
+    {"compiling", "kernels"},
     {"models", "layout"},
     {"estimator"},
     {"forms", "batch"},

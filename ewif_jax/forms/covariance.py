@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.estimator import verdict
 from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.kernels.batched import largest
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -111,6 +112,6 @@ def _inflated(cov: Array, factor: Array) -> Array:
 def _saturated(factor: Array, cov: Array) -> Array:
     factor = jnp.minimum(jnp.asarray(factor, cov.dtype), 1 / jnp.finfo(cov.dtype).eps)
     ceiling = jnp.sqrt(jnp.finfo(cov.dtype).max)
-    largest = jnp.max(jnp.abs(cov))
-    room = ceiling / jnp.where(largest > 0, largest, 1)
+    top = largest(jnp.abs(cov))
+    room = ceiling / jnp.where(top > 0, top, 1)
     return jnp.minimum(factor, jnp.maximum(room, 1))

@@ -13,7 +13,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.batched import kernel, total
+from ewif_jax.kernels.batched import kernel, largest, total
 from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.kernels.sparse import transposed
 from ewif_jax.models import Model
@@ -123,7 +123,7 @@ def estimate(state: InformationState) -> Gaussian:
 def settled(state: InformationState) -> Gaussian:
     """The estimate of a state that is `recentred` whenever there is one: the reference itself."""
     cov, full_rank = symmetric.inverse(state.matrix)
-    centred = full_rank & jnp.all(state.vector == 0)
+    centred = full_rank & (largest(jnp.abs(state.vector)) == 0)
     return Gaussian(
         jnp.where(centred, state.mean, jnp.nan),
         jnp.where(full_rank, symmetric.unpack(cov), jnp.nan),

@@ -83,6 +83,18 @@ _ADJOINTS[_turned] = _turned
 _APART.add(_turned)
 
 
+@kernel
+def largest(x: Array) -> Array:
+    """The largest of a short vector: a batch of reductions is no vector operation."""
+    return reduce(jnp.maximum, x)
+
+
+@kernel
+def smallest(x: Array) -> Array:
+    """The smallest of a short vector, likewise."""
+    return reduce(jnp.minimum, x)
+
+
 def _flat(fn: Function) -> Callable[..., Sequence[Array]]:
     def call(*args: Array) -> Sequence[Array]:
         out = fn(*args)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ewif_jax.kernels.batched import kernel, linear_kernel, stage, total
+from ewif_jax.kernels.batched import kernel, linear_kernel, smallest, stage, total
 from ewif_jax.kernels.small import matvec
 from ewif_jax.kernels.sparse import Pattern, by_row, full, multiplied
 
@@ -117,7 +117,7 @@ def inverse(packed: Array) -> tuple[Array, Array]:
     derivative is that of the exact inverse, -P^-1 dP P^-1.
     """
     result = _inverse(packed)
-    full_rank = jnp.all(diagonal(result) > 0)
+    full_rank = smallest(diagonal(result)) > 0
     identity = pack(jnp.eye(order(packed), dtype=packed.dtype))
     return jnp.where(full_rank, result, identity), full_rank
 

@@ -1,6 +1,5 @@
 """The command `ewif-jax`."""
 
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -8,6 +7,7 @@ from importlib.util import find_spec
 
 import jax
 
+from ewif_jax.compiling import prepare_cpu
 from ewif_jax.study.arguments import parser
 from ewif_jax.study.registry import STUDIES
 
@@ -15,9 +15,8 @@ EXTRA = ("h5netcdf", "h5py", "matplotlib", "pandas", "pyproj", "rich", "xarray")
 
 
 def main() -> None:
-    """Entry point: makes every core a JAX device, then `run`."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    jax.config.update("jax_num_cpu_devices", cores or 1)
+    """Entry point: `prepare_cpu`, then `run`."""
+    prepare_cpu()
     raise SystemExit(run(sys.argv[1:]))
 
 

@@ -86,7 +86,7 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
     )
     q = np.linspace(0.1, 2.0, runs)
     assert layout.group_size(runs, 8 * (1 + 4 + 10), 8 * 16) == (1 if cache == 1 else 16)
-    assert layout._block(steps) == 8
+    assert layout._block(steps) == 16
     estimator = ej.kalman(MODEL)
     got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
     for k in (0, 17, 31):

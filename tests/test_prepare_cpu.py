@@ -1,0 +1,83 @@
+"""`prepare_cpu` changes how fast filters are, and no number."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import ewif_jax as ej
+
+CHILD = """
+import sys
+import jax
+import jax.numpy as jnp
+import numpy as np
+import ewif_jax as ej
+
+if sys.argv[2] == "prepared":
+    ej.prepare_cpu(devices=2)
+    jax.devices()
+    ej.prepare_cpu(devices=2)  # asking twice is no mistake
+jax.config.update("jax_enable_x64", True)
+
+model = ej.models.constant_acceleration(sensors=ej.models.position_sensor(0.3), q=0.2)
+time = jnp.asarray([0.1, 0.2, 0.45, 0.3, 0.7, 0.71, 0.9])  # one is late
+values = jnp.sin(time + jnp.arange(4.0)[:, None])
+prior = ej.Gaussian(jnp.zeros(3), jnp.eye(3))
+filters = {"ewif": ej.ewif(model, lambda p: p["tau"]), "al1": ej.al1(model, 3)}
+found = {}
+for name, estimator in filters.items():
+    def filtered(params, value):
+        return ej.run(estimator, params, ej.stream(time, value), prior=prior, t0=0.0)
+    def loss(params):
+        return jnp.sum(filtered(params, values[0]).mean ** 2)
+    trace = filtered({"tau": 1.0}, values[0])
+    batch = ej.run_batch(
+        estimator, {"tau": 1.0}, jax.vmap(lambda v: ej.stream(time, v))(values), prior=prior, t0=0.0
+    )
+    found |= {f"{name} mean": trace.mean, f"{name} cov": trace.cov, f"{name} batch": batch.mean}
+    found[f"{name} slope"] = jax.jit(jax.grad(loss))({"tau": 1.0})["tau"]
+program = jax.jit(lambda x: jax.lax.scan(lambda c, _: (jnp.sin(c) + 1, c), x, None, length=99)[1])
+text = program.lower(jnp.ones(300)).compile().as_text()
+found["whole"] = "xla_cpu_small_call" in text
+found["devices"] = len(jax.devices())
+np.savez(sys.argv[1], **found)
+"""
+
+
+def numbers(file, how, flags=""):
+    environment = {**os.environ, "XLA_FLAGS": flags}
+    command = [sys.executable, "-c", CHILD, str(file), how]
+    subprocess.run(command, env=environment, check=True)
+    return dict(np.load(file))
+
+
+def test_loops_become_one_function_and_cores_devices_and_no_number_changes(tmp_path):
+    plain = numbers(tmp_path / "plain.npz", "plain")
+    prepared = numbers(tmp_path / "prepared.npz", "prepared")
+    assert (plain.pop("whole"), prepared.pop("whole")) == (False, True)
+    assert (plain.pop("devices"), prepared.pop("devices")) == (1, 2)
+    for name, expected in plain.items():
+        np.testing.assert_allclose(prepared[name], expected, rtol=1e-10, atol=1e-12, err_msg=name)
+
+
+def test_too_late_and_bad_sizes_are_refused():
+    jax.devices()
+    with pytest.raises(RuntimeError, match="before"):
+        ej.prepare_cpu(devices=2)
+    with pytest.raises(ValueError, match=r"devices.*whole number >= 1.*0"):
+        ej.prepare_cpu(devices=0)
+
+
+def test_options_of_the_user_stay(monkeypatch):
+    monkeypatch.setattr(jax.config, "update", lambda name, value: None)
+    mine = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=7"
+    monkeypatch.setenv("XLA_FLAGS", mine)
+    ej.prepare_cpu()
+    assert os.environ["XLA_FLAGS"] == mine
+    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=somewhere")
+    ej.prepare_cpu()
+    assert os.environ["XLA_FLAGS"].startswith("--xla_dump_to=somewhere --xla_backend_extra_options")
