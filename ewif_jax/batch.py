@@ -82,7 +82,8 @@ def run_batch(
             everything; what it does not use is not computed.
         context: pytree of what else `observe` sees of each arrival, leaves (T, ...), or
             (R, T, ...) where marked in `context_per_run` (a prefix, like `params_per_run`).
-        devices: how many local devices share the runs (default all; R must be a multiple).
+        devices: how many local devices share the runs, at most; as many as divide R. Default all;
+            one CPU where the call is part of another program (a jitted or differentiated loss).
 
     Returns:
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
@@ -99,7 +100,7 @@ def run_batch(
         broadcast_prefix(context_per_run, context),
     )
     keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
-    count = device_count(runs, devices)
+    count = device_count(runs, devices, inputs)
     inputs = on_devices((*inputs, keys, context), flags, count)
     mask = checks.known(measurements.mask)
     complete = mask is not None and bool(mask.all())

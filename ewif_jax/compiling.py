@@ -66,12 +66,16 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
 
     @wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        # The zero is a tracer if a surrounding program is being traced, whatever comes in.
-        leaves = (jnp.zeros(()), *jax.tree.leaves((args, kwargs)))
-        inner = any(isinstance(x, Tracer) for x in leaves)
+        inner = transformed((args, kwargs))
         return (plain if inner or not _known() else quick)(*args, **kwargs)
 
     return call
+
+
+def transformed(inputs: Any) -> bool:
+    """Whether a call with these inputs becomes a part of another program."""
+    # The zero is a tracer if a surrounding program is being traced, whatever comes in.
+    return any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(inputs)))
 
 
 @cache

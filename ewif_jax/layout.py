@@ -13,6 +13,7 @@ from jax.extend.core import Literal
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ewif_jax import checks
+from ewif_jax.compiling import transformed
 from ewif_jax.kernels.batched import contiguous, turned
 
 
@@ -256,10 +257,17 @@ def _mesh(devices: int) -> Mesh:
     return Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
 
 
-def device_count(runs: int, devices: int | None) -> int:
-    """How many local devices to use: the largest number up to `devices` that divides `runs`."""
-    limit = len(jax.local_devices()) if devices is None else checks.whole("devices", devices, 1)
-    limit = min(limit, len(jax.local_devices()))
+def device_count(runs: int, devices: int | None, inputs: Any) -> int:
+    """How many local devices to use: the largest number up to `devices` that divides `runs`.
+
+    By default all, but one CPU inside another program. What that program adds up over devices they
+    wait for, and XLA's CPU threads, no more than the devices, may then all wait for each other.
+    """
+    limit = len(jax.local_devices())
+    if devices is not None:
+        limit = min(checks.whole("devices", devices, 1), limit)
+    elif jax.default_backend() == "cpu" and transformed(inputs):
+        limit = 1
     return max(d for d in range(1, limit + 1) if runs % d == 0)
 
 

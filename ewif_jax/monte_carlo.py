@@ -135,7 +135,7 @@ def monte_carlo(
             devices=devices,
         )
         values = {name: x[:count] for name, x in values.items()}
-        runwise, absent, sums = jax.device_get(_summarise(values))
+        runwise, absent, sums = jax.device_get(_summarise(_at_hand(values)))
         per_run.append(runwise)
         missing.append(absent)
         moments = sums if moments is None else jax.tree.map(np.add, moments, sums)
@@ -167,6 +167,12 @@ def dependent_on_key(simulate: Callable[[Array], Simulation], key: Array) -> Sim
 def _simulate(simulate: Callable[[Array], Simulation], keys: Array, flags: Frozen) -> Simulation:
     axes = jax.tree.map(lambda f: 0 if f else None, flags.tree)
     return jax.vmap(simulate, out_axes=axes)(keys)
+
+
+def _at_hand(values: dict[str, Array]) -> dict[str, Any]:
+    """Values that several CPU devices have, on one: adding them up, the devices would wait for each
+    other."""
+    return jax.device_get(values) if jax.default_backend() == "cpu" else values
 
 
 @jax.jit

@@ -29,17 +29,22 @@ values = jnp.sin(time + jnp.arange(4.0)[:, None])
 prior = ej.Gaussian(jnp.zeros(3), jnp.eye(3))
 filters = {"ewif": ej.ewif(model, lambda p: p["tau"]), "al1": ej.al1(model, 3)}
 found = {}
+batch = jax.vmap(lambda v: ej.stream(time, v))(values)
 for name, estimator in filters.items():
     def filtered(params, value):
         return ej.run(estimator, params, ej.stream(time, value), prior=prior, t0=0.0)
     def loss(params):
         return jnp.sum(filtered(params, values[0]).mean ** 2)
     trace = filtered({"tau": 1.0}, values[0])
-    batch = ej.run_batch(
-        estimator, {"tau": 1.0}, jax.vmap(lambda v: ej.stream(time, v))(values), prior=prior, t0=0.0
-    )
-    found |= {f"{name} mean": trace.mean, f"{name} cov": trace.cov, f"{name} batch": batch.mean}
+    batched = ej.run_batch(estimator, {"tau": 1.0}, batch, prior=prior, t0=0.0)
+    found |= {f"{name} mean": trace.mean, f"{name} cov": trace.cov, f"{name} batch": batched.mean}
     found[f"{name} slope"] = jax.jit(jax.grad(loss))({"tau": 1.0})["tau"]
+error = ej.rmse_loss(filters["ewif"], batch, values[..., None], prior=prior, t0=0.0)
+program = jax.jit(jax.value_and_grad(error)).lower({"tau": jnp.asarray(1.0)}).compile()
+found["loss and gradient"] = jnp.stack([x["tau"] if isinstance(x, dict) else x
+                                        for x in program({"tau": jnp.asarray(1.0)})])
+found["waits"] = "all-reduce" in program.as_text()
+found["spread"] = len(batched.mean.devices())
 program = jax.jit(lambda x: jax.lax.scan(lambda c, _: (jnp.sin(c) + 1, c), x, None, length=99)[1])
 text = program.lower(jnp.ones(300)).compile().as_text()
 found["whole"] = "xla_cpu_small_call" in text
@@ -60,6 +65,10 @@ def test_loops_become_one_function_and_cores_devices_and_no_number_changes(tmp_p
     prepared = numbers(tmp_path / "prepared.npz", "prepared")
     assert (plain.pop("whole"), prepared.pop("whole")) == (False, True)
     assert (plain.pop("devices"), prepared.pop("devices")) == (1, 2)
+    assert (plain.pop("spread"), prepared.pop("spread")) == (1, 2)
+    # A loss over several devices would add up what each has, and their threads wait for each other.
+    assert not plain.pop("waits")
+    assert not prepared.pop("waits")
     for name, expected in plain.items():
         np.testing.assert_allclose(prepared[name], expected, rtol=1e-10, atol=1e-12, err_msg=name)
 
