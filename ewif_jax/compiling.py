@@ -32,7 +32,7 @@ def prepare_cpu(devices: int | None = None) -> None:
 
     * Loops over small arrays are compiled as one function each. Otherwise XLA calls one function
       for every operation, which takes longer than the operation where a single series or up to a
-      few hundred runs are filtered: such filters become 1.3 to 20 times faster. (This is an option
+      few hundred runs are filtered: such filters become up to 20 times faster. (This is an option
       in the environment variable ``XLA_FLAGS``, unless that sets such options already.)
     * Every core is a device, over which batches spread their runs.
 
