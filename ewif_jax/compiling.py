@@ -24,6 +24,8 @@ QUICKEST: Mapping[str, Any] = {**QUICK, "xla_backend_optimization_level": 0}
 
 
 _WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1500000"
+"""Bytes that a round of the loop reads and writes: less than the loop over blocks of a large batch,
+whose results are laid out faster by several threads."""
 
 
 def prepare_cpu(devices: int | None = None) -> None:

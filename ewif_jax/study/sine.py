@@ -145,8 +145,8 @@ def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
     label = f"{one.name}: tuning on {len(keys)} sampled runs"
     with experiment.timed(label), experiment.progress(label) as report:
         training = simulate_batch(sine(dt=DT, r=VARIANCE), keys)
-        setting = {"prior": None, "t0": 0.0, "devices": 1}
-        loss = rmse_loss(one.estimator, training.measurements, training.truth, **setting)
+        data = training.measurements, training.truth
+        loss = rmse_loss(one.estimator, *data, prior=None, t0=0.0)
         sampled = tune(loss, {name: np.asarray(one.starts[1])}, steps=steps, progress=report)
     label = f"{one.name}: tuning on the exact error"
     with experiment.timed(label), experiment.progress(label) as report:

@@ -73,7 +73,6 @@ def loss(
             scores={"score": score},
             prior=method.prior,
             t0=0.0,
-            devices=1,
         )
         return finish(jnp.where(counted, values["score"], jnp.nan))
 
