@@ -23,7 +23,9 @@ QUICKEST: Mapping[str, Any] = {**QUICK, "xla_backend_optimization_level": 0}
 """Half of that or less. Small arrays take up to 3 times as long, long ones up to 10 times."""
 
 
-_WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1500000"
+_OPTIONS = "--xla_backend_extra_options"
+_WHOLE_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+_WHOLE_LOOPS_BELOW = 1_500_000
 """Bytes that a round of the loop reads and writes: less than the loop over blocks of a large batch,
 whose results are laid out faster by several threads."""
 
@@ -47,12 +49,17 @@ def prepare_cpu(devices: int | None = None) -> None:
     """
     count = _cores() if devices is None else checks.whole("devices", devices, 1)
     flags = os.environ.get("XLA_FLAGS", "")
-    chosen = "--xla_backend_extra_options" in flags
+    chosen = _OPTIONS in flags
     if chosen and jax.config.values.get("jax_num_cpu_devices") == count:
         return  # a notebook's first cell may run again
     jax.config.update("jax_num_cpu_devices", count)
     if not chosen:
-        os.environ["XLA_FLAGS"] = f"{flags} {_WHOLE_LOOPS}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {_OPTIONS}={_WHOLE_LOOPS}={_WHOLE_LOOPS_BELOW}".strip()
+
+
+def loops_are_joined() -> bool:
+    """Whether this process compiles loops over small arrays as one function."""
+    return _WHOLE_LOOPS in os.environ.get("XLA_FLAGS", "")
 
 
 def _cores() -> int:

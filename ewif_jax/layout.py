@@ -13,47 +13,32 @@ from jax.extend.core import Literal
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ewif_jax import checks
-from ewif_jax.compiling import transformed
+from ewif_jax.compiling import loops_are_joined, transformed
 from ewif_jax.kernels.batched import contiguous, turned
 
 
 def vmap_last(
-    fn: Callable[..., Any], in_flags: tuple, force: Any = None, trace_only: bool = False
-) -> Callable[..., tuple[Any, Any]]:
-    """`fn` mapped over the last axis of the flagged inputs; returns (outputs, their flags).
-
-    Outputs that cannot depend on a flagged input come back without the run axis, unless `force`
-    (a pytree of bools for the first output, None for the rest) asks for it.
-    """
-
-    def mapped(*args: Any) -> tuple[Any, Any]:
-        single = jax.tree.map(
-            lambda x, f: jax.eval_shape(lambda x: x[..., 0], x) if f else x, args, in_flags
-        )
-        closed, shape = jax.make_jaxpr(fn, return_shape=True)(*single)
-        flat = jax.tree.leaves(in_flags)
-        tree = jax.tree.structure(shape)
-        out = dependent(closed.jaxpr, flat)
-        if force is not None:
-            wanted = jax.tree.leaves(force[0])
-            out = [a or b for a, b in zip(out, wanted + out[len(wanted) :], strict=True)]
-        out_flags = jax.tree.unflatten(tree, out)
-        if trace_only or not any(flat):
-            return (None if trace_only else fn(*args)), out_flags
-        axes = jax.tree.map(lambda f: -1 if f else None, in_flags)
-        out_axes = jax.tree.map(lambda f: -1 if f else None, out_flags)
-        return jax.vmap(fn, in_axes=axes, out_axes=out_axes)(*args), out_flags
-
-    return mapped
+    fn: Callable[..., Any], in_flags: Any, out_flags: Any, runs: int
+) -> Callable[..., Any]:
+    """`fn` mapped over the last axis, of `runs`, of the flagged inputs; its flagged outputs have
+    one."""
+    in_axes, out_axes = (
+        jax.tree.map(lambda f: -1 if f else None, flags) for flags in (in_flags, out_flags)
+    )
+    flagged = any(jax.tree.leaves((in_flags, out_flags)))
+    return jax.vmap(fn, in_axes, out_axes, axis_size=runs) if flagged else fn
 
 
-def dependent(jaxpr: Any, flags: list[bool]) -> list[bool]:
-    """Which outputs of a jaxpr can depend on the flagged inputs (never too few)."""
-    tainted = {v for v, f in zip(jaxpr.invars, flags, strict=True) if f}
+def dependence(fn: Callable[..., Any], flags: Any, *args: Any) -> Any:
+    """Which outputs of `fn` can depend on the flagged inputs (a pytree of bools; never too few)."""
+    closed, shape = jax.make_jaxpr(fn, return_shape=True)(*args)
+    jaxpr = closed.jaxpr
+    tainted = {v for v, f in zip(jaxpr.invars, jax.tree.leaves(flags), strict=True) if f}
     for eqn in jaxpr.eqns:
         if any(not isinstance(v, Literal) and v in tainted for v in eqn.invars):
             tainted.update(eqn.outvars)
-    return [not isinstance(v, Literal) and v in tainted for v in jaxpr.outvars]
+    found = [not isinstance(v, Literal) and v in tainted for v in jaxpr.outvars]
+    return jax.tree.unflatten(jax.tree.structure(shape), found)
 
 
 def first_run(tree: Any, flags: Any) -> Any:
@@ -164,25 +149,38 @@ def unrolled(whole: Any, shapes: Any) -> Any:
 
 
 def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 20, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 20) + 1) if steps % d == 0)
+    """The largest divisor of `steps` up to 40, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 40) + 1) if steps % d == 0)
     return best if best >= 5 else steps
 
 
-def group_size(runs: int, state: int, largest: int) -> int:
-    """How many runs to filter at once, from the bytes that one run's state and its largest array
-    take: a divisor of `runs` for which the states stay in the cache and no array is so large that
-    the compiler would have several threads wait for each other at every step; or 1 where that would
-    leave too few to fill vectors (a state that large is a vector itself). What is no CPU takes all
-    runs at once."""
+def group_size(runs: int, own: int, shared: int, largest: int) -> int:
+    """How many runs to filter at once: a divisor of `runs`, or 1 where that would leave too few to
+    fill vectors (a state that large is a vector itself). What is no CPU takes all runs at once.
+
+    The states stay in the second cache, and no array is so large that the compiler would have
+    several threads wait for each other at every step. Where a loop is one function, so that
+    shorter vectors cost nothing, states stay in the first cache, unless most of a state is shared:
+    each group computes that again.
+
+    Args:
+        runs: how many there are.
+        own: bytes of what each run has of its own in its state.
+        shared: bytes of what all runs share.
+        largest: bytes of the largest array in a run's state or in its estimate.
+    """
     if jax.default_backend() != "cpu":
         return runs
-    room = max(min(_CACHE // max(state, 1), _UNDIVIDED // max(largest, 1)), 1)
-    best = max(d for d in range(1, min(room, runs) + 1) if runs % d == 0)
+    room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
+    if own > shared and loops_are_joined():
+        room = min(room, max(_FIRST_CACHE // own, 128))
+    # Rows of a multiple of 8 are whole vectors, which is worth a quarter.
+    divisors = (d for d in range(1, min(room, runs) + 1) if runs % d == 0)
+    best = max(divisors, key=lambda d: d * (4 if d % 8 else 5))
     return best if best >= 16 else runs if room >= min(runs, 16) else 1
 
 
-_CACHE, _UNDIVIDED = 2**19, 2**18
+_FIRST_CACHE, _SECOND_CACHE, _UNDIVIDED = 2**15, 2**19, 2**18
 
 
 def in_groups(
@@ -289,11 +287,6 @@ class Frozen:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Frozen) and self._id == other._id
-
-
-def spread(x: Array, runs: int) -> Array:
-    """`x` repeated along a new last axis."""
-    return jnp.broadcast_to(x[..., None], (*x.shape, runs))
 
 
 def _is_key(x: Any) -> bool:

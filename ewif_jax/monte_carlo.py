@@ -11,7 +11,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import Clock
-from ewif_jax.layout import Frozen, broadcast_prefix, dependent
+from ewif_jax.layout import Frozen, broadcast_prefix, dependence
 from ewif_jax.scores import Score, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -153,14 +153,8 @@ def monte_carlo(
 def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:
     """One simulation per key, stacked on axis 0; what does not depend on the key stays shared
     (without that axis), so that filters compute with it once."""
-    flags = dependent_on_key(scenario.simulate, keys[0])
+    flags = dependence(scenario.simulate, True, keys[0])
     return _simulate(scenario.simulate, keys, Frozen(flags))
-
-
-def dependent_on_key(simulate: Callable[[Array], Simulation], key: Array) -> Simulation:
-    """Which leaves of a simulation can differ between runs (a pytree of bools)."""
-    closed, shape = jax.make_jaxpr(simulate, return_shape=True)(key)
-    return jax.tree.unflatten(jax.tree.structure(shape), dependent(closed.jaxpr, [True]))
 
 
 @partial(jax.jit, static_argnames=("simulate", "flags"))

@@ -70,13 +70,13 @@ def test_gradients_go_through_groups_of_runs(steps, monkeypatch):
         return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
 
     together = jax.value_and_grad(loss)(0.7)
-    monkeypatch.setattr(layout, "_CACHE", 16 * 8 * (1 + 4 + 10))
+    monkeypatch.setattr(layout, "_SECOND_CACHE", 16 * 8 * (1 + 4 + 10))
     np.testing.assert_allclose(jax.value_and_grad(loss)(0.7), together, rtol=1e-10)
 
 
 @pytest.mark.parametrize("cache", [1, 16 * 8 * (1 + 4 + 10)], ids=["one_by_one", "in_groups"])
 def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
-    monkeypatch.setattr(layout, "_CACHE", cache)
+    monkeypatch.setattr(layout, "_SECOND_CACHE", cache)
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     runs, steps = 32, 96
     rng = np.random.default_rng(5)
@@ -85,8 +85,8 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
         time, rng.normal(size=(runs, steps, 2)), np.zeros(steps, int), np.ones((steps, 2), bool)
     )
     q = np.linspace(0.1, 2.0, runs)
-    assert layout.group_size(runs, 8 * (1 + 4 + 10), 8 * 16) == (1 if cache == 1 else 16)
-    assert layout._block(steps) == 16
+    assert layout.group_size(runs, 8 * (4 + 10), 8, 8 * 16) == (1 if cache == 1 else 16)
+    assert layout._block(steps) == 32
     estimator = ej.kalman(MODEL)
     got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
     for k in (0, 17, 31):
