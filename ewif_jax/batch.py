@@ -3,7 +3,7 @@
 Inside, the runs are the last axis of every array and the scan goes over time outside of `vmap`, so
 each small-matrix operation becomes one long vector operation. What does not depend on the run (the
 covariance, when times, masks and parameters are shared) is found by following the data flow, and
-computed once. Outside, runs lead.
+computed once, ahead of the rest. Outside, runs lead.
 """
 
 from collections.abc import Callable
@@ -18,21 +18,13 @@ from ewif_jax import checks
 from ewif_jax.estimator import Clock, advance, float_dtype, initial, validated
 from ewif_jax.layout import (
     Frozen,
-    Place,
     broadcast_prefix,
-    dependence,
     device_count,
     first_run,
-    group_size,
-    in_groups,
     on_devices,
     over_devices,
-    runs_adjacent,
-    runs_first,
-    runs_last,
-    scan_in_blocks,
-    vmap_last,
 )
+from ewif_jax.loops import Loop, over_runs
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
 
@@ -161,24 +153,10 @@ def _run_batch(
     )
     times = None if times is None else jnp.asarray(times, dtype)
     inputs = (params, measurements, prior, times, keys, context)
-
     loop = _loop(estimator, t0, clock, observe or _everything, complete, dtype)
 
     def filtered(*inputs: Any) -> Any:
-        runs = inputs[1].value.shape[0]
-        one = jax.eval_shape(lambda inputs: first_run(inputs, flags.tree), inputs)
-        differ = _that_differ(loop, one, flags.tree)
-        size = group_size(runs, *_sizes(estimator, loop, one, differ[0]))
-
-        def together(inputs: Any, place: Place | None) -> Any:
-            if size > 1:
-                return _scanned(
-                    loop, runs_last(inputs, flags.tree), flags.tree, differ, size, place
-                )
-            inputs, alike = first_run(inputs, flags.tree), _alike(flags.tree)
-            return _scanned(loop, inputs, alike, _alike(differ), size, place)
-
-        return in_groups(together, inputs, flags.tree, runs, size)
+        return over_runs(loop, estimator.estimate, inputs, flags.tree)
 
     seen, state = over_devices(filtered, flags.tree, devices)(*inputs)
     if observe is not None:
@@ -187,18 +165,9 @@ def _run_batch(
     return Trace(time, mean, cov, info, state)
 
 
-class _Loop(NamedTuple):
-    """The scan of one run."""
-
-    start: Callable[[Any, Any, Any], Any]
-    """(params, prior, key) -> state."""
-    step: Callable[[Any, Any, Any], tuple[Any, Any]]
-    """(params, state, arrival) -> state, what is observed of it."""
-
-
 def _loop(
     estimator: Estimator, t0: Any, clock: Clock, observe: Observer, complete: bool, dtype: Any
-) -> _Loop:
+) -> Loop:
     def start(params: Any, prior: Any, key: Any) -> Any:
         return initial(estimator, params, prior, t0, dtype, key)
 
@@ -214,74 +183,9 @@ def _loop(
         mean, cov = estimator.estimate(params, shown)
         return moved.kept, observe(Step(shown.time, mean, cov, moved.info), seen)
 
-    return _Loop(start, step)
+    return Loop(start, step)
 
 
 def _everything(step: Step, context: Any) -> Step:
     del context
     return step
-
-
-def _that_differ(loop: _Loop, one: Any, flags: Any) -> tuple[Any, Any]:
-    """Which leaves of the state, and of what is observed, differ by run (pytrees of bools), from
-    the inputs of one run and which of these do."""
-    params, measurements, prior, times, key, context = one
-    params_f, measurements_f, prior_f, times_f, key_f, context_f = flags
-    state = jax.eval_shape(loop.start, params, prior, key)
-    state_f = dependence(loop.start, (params_f, prior_f, key_f), params, prior, key)
-    arrival = jax.eval_shape(_first, (measurements, times, context))
-    arrival_f = measurements_f, times_f, context_f
-    while True:
-        later_f, seen_f = dependence(
-            loop.step, (params_f, state_f, arrival_f), params, state, arrival
-        )
-        either = jax.tree.map(lambda a, b: a or b, state_f, later_f)
-        if either == state_f:
-            return state_f, seen_f
-        state_f = either
-
-
-def _alike(flags: Any) -> Any:
-    return jax.tree.map(lambda _: False, flags)
-
-
-def _first(arrivals: Any) -> Any:
-    return jax.tree.map(lambda x: x[0], arrivals)
-
-
-def _sizes(estimator: Estimator, loop: _Loop, one: Any, state_f: Any) -> tuple[int, int, int]:
-    """The bytes of a run's own state, of the state that all share, and of the largest array in one
-    or in an estimate."""
-    params, _, prior, _, key, _ = one
-    state = jax.eval_shape(loop.start, params, prior, key)
-    shown = jax.eval_shape(estimator.estimate, params, state)
-    sizes, estimated = (
-        [x.size * x.dtype.itemsize for x in jax.tree.leaves(t)] for t in (state, shown)
-    )
-    own = sum(x for x, f in zip(sizes, jax.tree.leaves(state_f), strict=True) if f)
-    return own, sum(sizes) - own, max(*sizes, *estimated)
-
-
-def _scanned(
-    loop: _Loop, inputs: Any, flags: Any, differ: tuple[Any, Any], runs: int, place: Place | None
-) -> tuple[Any, Any]:
-    """Observations (R, T, ...) and final states (R, ...) from inputs with the runs last."""
-    params, measurements, prior, times, keys, context = inputs
-    params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
-    state_f, seen_f = differ
-    arrival_f = measurements_f, times_f, context_f
-    start = vmap_last(loop.start, (params_f, prior_f, keys_f), state_f, runs)
-    step = vmap_last(loop.step, (params_f, state_f, arrival_f), differ, runs)
-
-    def arrive(state: Any, arrival: Any) -> tuple[Any, Any]:
-        state, seen = step(params, runs_adjacent(state, state_f), arrival)
-        return runs_adjacent(state, state_f), seen
-
-    seen, state = scan_in_blocks(
-        arrive,
-        start(params, prior, keys),
-        (measurements, times, context),
-        lambda seen: runs_first(seen, seen_f, runs),
-        place,
-    )
-    return seen, runs_first(state, state_f, runs)

@@ -1,6 +1,6 @@
-"""Runs as the last axis: mapping over it, following what depends on it, splitting it up."""
+"""Runs as the last axis: mapping over it, splitting it up."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
-from jax.extend.core import Literal
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ewif_jax import checks
@@ -29,16 +28,16 @@ def vmap_last(
     return jax.vmap(fn, in_axes, out_axes, axis_size=runs) if flagged else fn
 
 
-def dependence(fn: Callable[..., Any], flags: Any, *args: Any) -> Any:
-    """Which outputs of `fn` can depend on the flagged inputs (a pytree of bools; never too few)."""
-    closed, shape = jax.make_jaxpr(fn, return_shape=True)(*args)
-    jaxpr = closed.jaxpr
-    tainted = {v for v, f in zip(jaxpr.invars, jax.tree.leaves(flags), strict=True) if f}
-    for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in tainted for v in eqn.invars):
-            tainted.update(eqn.outvars)
-    found = [not isinstance(v, Literal) and v in tainted for v in jaxpr.outvars]
-    return jax.tree.unflatten(jax.tree.structure(shape), found)
+def parted(tree: Any, flags: Any) -> tuple[list[Any], list[Any]]:
+    """The leaves that are flagged, and the others."""
+    pairs = list(zip(jax.tree.leaves(tree), jax.tree.leaves(flags), strict=True))
+    return [x for x, f in pairs if f], [x for x, f in pairs if not f]
+
+
+def joined(flagged: Sequence[Any], others: Sequence[Any], flags: Any) -> Any:
+    """The tree whose leaves `parted` would part into these."""
+    marked, rest = iter(flagged), iter(others)
+    return jax.tree.map(lambda f: next(marked) if f else next(rest), flags)
 
 
 def first_run(tree: Any, flags: Any) -> Any:
@@ -149,14 +148,14 @@ def unrolled(whole: Any, shapes: Any) -> Any:
 
 
 def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 40, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 40) + 1) if steps % d == 0)
+    """The largest divisor of `steps` up to 20, or all of them if there is no good one."""
+    best = max(d for d in range(1, min(steps, 20) + 1) if steps % d == 0)
     return best if best >= 5 else steps
 
 
-def group_size(runs: int, own: int, shared: int, largest: int) -> int:
-    """How many runs to filter at once: a divisor of `runs`, or 1 where that would leave too few to
-    fill vectors (a state that large is a vector itself). What is no CPU takes all runs at once.
+def group_size(runs: int, own: int, shared: int, largest: int, itemsize: int) -> int:
+    """How many runs to filter at once; 1 where a few would be too many (a state that large is a
+    vector itself). What is no CPU takes all runs at once.
 
     The states stay in the second cache, and no array is so large that the compiler would have
     several threads wait for each other at every step. Where a loop is one function, so that
@@ -168,19 +167,37 @@ def group_size(runs: int, own: int, shared: int, largest: int) -> int:
         own: bytes of what each run has of its own in its state.
         shared: bytes of what all runs share.
         largest: bytes of the largest array in a run's state or in its estimate.
+        itemsize: bytes of a number.
     """
     if jax.default_backend() != "cpu":
         return runs
     room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
     if own > shared and loops_are_joined():
-        room = min(room, max(_FIRST_CACHE // own, 128))
-    # Rows of a multiple of 8 are whole vectors, which is worth a quarter.
-    divisors = (d for d in range(1, min(room, runs) + 1) if runs % d == 0)
-    best = max(divisors, key=lambda d: d * (4 if d % 8 else 5))
-    return best if best >= 16 else runs if room >= min(runs, 16) else 1
+        room = min(room, max(_FIRST_CACHE // own, 128), 256)
+    if room < min(runs, 16):
+        return 1
+    fewest = -(-runs // room)
+    sizes = [_odd_lines(-(-runs // groups), itemsize) for groups in range(fewest, 2 * fewest + 2)]
+    candidates = [size for size in sizes if min(room, 64) <= size <= min(room, runs)]
+    candidates += [runs] * (runs <= room)
+    return min(candidates, key=lambda size: _work(runs, size, itemsize), default=room)
 
 
-_FIRST_CACHE, _SECOND_CACHE, _UNDIVIDED = 2**15, 2**19, 2**18
+def _odd_lines(size: int, itemsize: int) -> int:
+    """The next size of a vector that is an odd number of cache lines."""
+    line = _LINE // itemsize
+    lines = -(-size // line)
+    return (lines + 1 - lines % 2) * line
+
+
+def _work(runs: int, size: int, itemsize: int) -> float:
+    """Rows of an odd number of lines come to lie in all sets of a cache, others in each other's
+    way: with rows of a power of two a transpose takes ten times as long."""
+    lines = size * itemsize / _LINE
+    return -(-runs // size) * size * (1 if lines % 2 == 1 else 1.25)
+
+
+_FIRST_CACHE, _SECOND_CACHE, _UNDIVIDED, _LINE = 2**15, 2**19, 2**18, 64
 
 
 def in_groups(
@@ -191,29 +208,32 @@ def in_groups(
     size: int,
 ) -> tuple[Any, Any]:
     """`fn` of `size` runs at a time, the leading axis of the flagged leaves that go in and of all
-    that come out: what is shown, which `fn` puts in its place, and the last states."""
+    that come out: what is shown, which `fn` puts in its place, and the last states.
+
+    Groups overlap where `size` does not divide the runs.
+    """
     if size == runs:
         return fn(inputs, None)
-    leaves, tree = jax.tree.flatten(inputs)
-    marked = jax.tree.leaves(flags)
-    groups = runs // size
-    split = [
-        x.reshape(groups, size, *x.shape[1:]) for x, f in zip(leaves, marked, strict=True) if f
-    ]
+    groups = -(-runs // size)
+    begins = np.arange(groups) * (runs - size) // (groups - 1)
 
-    def merged(group: list[Array]) -> Any:
-        some = iter(group)
-        mixed = [next(some) if f else x for x, f in zip(leaves, marked, strict=True)]
-        return jax.tree.unflatten(tree, mixed)
+    def some(begin: Any) -> Any:
+        return jax.tree.map(
+            lambda x, f: lax.dynamic_slice_in_dim(x, begin, size) if f else x, inputs, flags
+        )
 
-    def one(whole: Any, numbered: Any) -> tuple[Any, Any]:
-        number, group = numbered
-        return fn(merged(group), Place(whole, number * size))
+    def one(whole: Any, begin: Any) -> tuple[Any, Any]:
+        return fn(some(begin), Place(whole, begin))
 
-    shapes = jax.eval_shape(lambda group: fn(merged(group), None)[0], [x[0] for x in split])
+    shapes = jax.eval_shape(lambda: fn(some(0), None)[0])
     shapes = jax.tree.map(lambda x: x.update(shape=(runs, *x.shape[1:])), shapes)
-    whole, last = lax.scan(one, rows(shapes), (jnp.arange(groups), split))
-    return unrolled(whole, shapes), jax.tree.map(lambda x: x.reshape(runs, *x.shape[2:]), last)
+    whole, last = lax.scan(one, rows(shapes), jnp.asarray(begins))
+    last = jax.tree.map(lambda x: x.reshape(groups * size, *x.shape[2:]), last)
+    if groups * size > runs:
+        found = np.searchsorted(begins, np.arange(runs), "right") - 1
+        index = found * size + np.arange(runs) - begins[found]
+        last = jax.tree.map(lambda x: x[index], last)
+    return unrolled(whole, shapes), last
 
 
 def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable[..., Any]:

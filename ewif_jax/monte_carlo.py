@@ -10,8 +10,9 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.dependence import dependence, traced
 from ewif_jax.estimator import Clock
-from ewif_jax.layout import Frozen, broadcast_prefix, dependence
+from ewif_jax.layout import Frozen, broadcast_prefix
 from ewif_jax.scores import Score, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -153,7 +154,7 @@ def monte_carlo(
 def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:
     """One simulation per key, stacked on axis 0; what does not depend on the key stays shared
     (without that axis), so that filters compute with it once."""
-    flags = dependence(scenario.simulate, True, keys[0])
+    flags = dependence(traced(scenario.simulate, keys[0]), True)
     return _simulate(scenario.simulate, keys, Frozen(flags))
 
 

@@ -15,9 +15,9 @@ FILES = sorted(ROOT.rglob("*.py"))
 RANKS = (
     {"types"},
     {"checks"},
-    {"compiling", "kernels"},
+    {"compiling", "dependence", "kernels"},
     {"models", "layout"},
-    {"estimator"},
+    {"estimator", "loops"},
     {"forms", "batch"},
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 import ewif_jax as ej
-from ewif_jax import layout
+from ewif_jax import layout, loops
 from ewif_jax import scores as scores_of
 from ewif_jax.scores import scored
 
@@ -58,48 +59,142 @@ def test_run_batch_is_vmap_of_run(name, shared):
     assert jnp.all(jnp.isfinite(got.mean))
 
 
-@pytest.mark.parametrize("steps", [7, 20], ids=["one_block", "blocks"])
-def test_gradients_go_through_groups_of_runs(steps, monkeypatch):
-    """In reverse mode, with the results of all groups in one array."""
-    rng = np.random.default_rng(6)
-    values, time = rng.normal(size=(32, steps, 2)), np.cumsum(rng.uniform(0.1, 1.0, steps))
-    batch = ej.Measurement(time, values, np.zeros(steps, int), np.ones((steps, 2), bool))
-
-    def loss(q):
-        trace = ej.run_batch(ej.kalman(MODEL), {"q": q}, batch, prior=PRIOR, t0=0.0)
-        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
-
-    together = jax.value_and_grad(loss)(0.7)
-    monkeypatch.setattr(layout, "_SECOND_CACHE", 16 * 8 * (1 + 4 + 10))
-    np.testing.assert_allclose(jax.value_and_grad(loss)(0.7), together, rtol=1e-10)
-
-
-@pytest.mark.parametrize("cache", [1, 16 * 8 * (1 + 4 + 10)], ids=["one_by_one", "in_groups"])
-def test_neither_groups_of_runs_nor_blocks_of_steps_show(cache, monkeypatch):
-    monkeypatch.setattr(layout, "_SECOND_CACHE", cache)
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    runs, steps = 32, 96
+def regular(runs: int, steps: int, shared_time: bool = True) -> ej.Measurement:
     rng = np.random.default_rng(5)
     time = np.cumsum(rng.uniform(0.1, 1.0, (runs, steps)), 1)
-    batch = ej.Measurement(
-        time, rng.normal(size=(runs, steps, 2)), np.zeros(steps, int), np.ones((steps, 2), bool)
-    )
-    q = np.linspace(0.1, 2.0, runs)
-    assert layout.group_size(runs, 8 * (4 + 10), 8, 8 * 16) == (1 if cache == 1 else 16)
-    assert layout._block(steps) == 32
-    estimator = ej.kalman(MODEL)
-    got = ej.run_batch(estimator, {"q": q}, batch, prior=PRIOR, t0=0.0, params_per_run=True)
-    for k in (0, 17, 31):
-        one = jax.tree.map(lambda x, k=k: x[k] if x.ndim > 1 and len(x) == runs else x, batch)
-        wanted = ej.run(estimator, {"q": q[k]}, one, prior=PRIOR, t0=0.0)
-        np.testing.assert_allclose(got.mean[k], wanted.mean, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(got.cov[k], wanted.cov, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(got.final_state.mean[k], wanted.final_state.mean, atol=1e-12)
+    time = time[0] if shared_time else time
+    sensor, mask = np.zeros(steps, int), np.ones((steps, 2), bool)
+    return ej.Measurement(time, rng.normal(size=(runs, steps, 2)), sensor, mask)
+
+
+@pytest.fixture(params=[1, 16, 24], ids=["one_by_one", "dividing", "overlapping"])
+def groups(request, monkeypatch):
+    monkeypatch.setattr(loops, "group_size", lambda *_: request.param)
+
+
+@pytest.mark.parametrize("shared", ["nothing", "time", "all"])
+@pytest.mark.parametrize("steps", [7, 32], ids=["one_block", "blocks"])
+def test_neither_groups_of_runs_nor_blocks_of_steps_show(steps, shared, groups):
+    runs = 48
+    measurements = regular(runs, steps, shared_time=shared != "nothing")
+    q = np.linspace(0.1, 2.0, runs) if shared != "all" else 0.7
+    per_run = shared != "all"
+    estimator, start = ej.kalman(MODEL), {"prior": PRIOR, "t0": 0.0}
+    got = ej.run_batch(estimator, {"q": q}, measurements, **start, params_per_run=per_run)
+    for k in (0, 17, 23, 24, 40, 47):
+        one = jax.tree.map(lambda x, k=k: x[k] if x.shape[0] == runs else x, measurements)
+        wanted = ej.run(estimator, {"q": q[k] if per_run else q}, one, **start)
+        jax.tree.map(
+            lambda a, b, k=k: np.testing.assert_allclose(a[k], b, rtol=1e-10, atol=1e-12),
+            got,
+            wanted,
+        )
     scores = {"score": scores_of.squared_innovation}  # without a truth, which is then of width 0
     found = scored(
-        estimator, {"q": q}, batch, scores=scores, prior=PRIOR, t0=0.0, params_per_run=True
+        estimator, {"q": q}, measurements, scores=scores, **start, params_per_run=per_run
     )["score"]
     np.testing.assert_allclose(found, np.sum(got.info.innovation**2, -1), rtol=1e-10)
+
+
+@pytest.mark.parametrize("steps", [7, 20], ids=["one_block", "blocks"])
+def test_gradients_go_through_groups_of_runs(steps, groups):
+    """In both modes, with the results of all groups in one array."""
+    measurements = regular(40, steps)
+
+    def loss(q, filtered):
+        trace = filtered(ej.kalman(MODEL), {"q": q}, measurements)
+        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
+
+    def in_batch(estimator, params, measurements):
+        return ej.run_batch(estimator, params, measurements, prior=PRIOR, t0=0.0)
+
+    def one_by_one(estimator, params, measurements):
+        axes = (ej.Measurement(None, 0, None, None),)
+        return jax.vmap(lambda m: ej.run(estimator, params, m, prior=PRIOR, t0=0.0), in_axes=axes)(
+            measurements
+        )
+
+    wanted = jax.value_and_grad(loss)(0.7, one_by_one)
+    np.testing.assert_allclose(jax.value_and_grad(loss)(0.7, in_batch), wanted, rtol=1e-10)
+    forward = jax.jvp(lambda q: loss(q, in_batch), (0.7,), (1.0,))
+    np.testing.assert_allclose(forward, wanted, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("per_run", "packed"), [(False, (10,)), (True, (10, 24))])
+def test_covariances_that_all_share_are_computed_before_the_groups(per_run, packed, monkeypatch):
+    monkeypatch.setattr(loops, "group_size", lambda *_: 24)
+
+    def means(q):
+        return ej.run_batch(
+            ej.kalman(MODEL),
+            {"q": q},
+            regular(96, 20),
+            prior=PRIOR,
+            t0=0.0,
+            params_per_run=per_run,
+            observe=lambda step, _: step.mean,
+        )
+
+    q = np.full(96, 0.7) if per_run else np.float64(0.7)
+    everywhere = list(equations(jax.make_jaxpr(means)(q).jaxpr))
+    inside = within_loops(within_loops(everywhere, length=4), length=20)
+    assert packed in shapes(everywhere)
+    assert (packed in shapes(inside)) == per_run
+    assert (4, 24) in shapes(inside)
+
+
+@pytest.mark.parametrize("size", [24, 48], ids=["groups", "together"])
+def test_what_a_model_prints_is_printed(size, monkeypatch):
+    """Computed ahead or not, printing is no output of a step, and not to be lost."""
+    monkeypatch.setattr(loops, "group_size", lambda *_: size)
+    noted = []
+
+    def q(params):
+        jax.debug.callback(noted.append, params["q"])
+        return params["q"]
+
+    model = ej.models.constant_velocity(sensors=SENSORS, q=q, dims=2)
+    trace = ej.run_batch(ej.kalman(model), {"q": 0.7}, regular(48, 7), prior=PRIOR, t0=0.0)
+    jax.block_until_ready(trace)
+    jax.effects_barrier()
+    assert noted
+    assert set(map(float, noted)) == {0.7}
+
+
+def equations(jaxpr):
+    """All of them, also of the loops and functions inside."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jaxprs_in_params(eqn.params):
+            yield from equations(inner)
+
+
+def within_loops(among, length):
+    """The equations of all loops of a length."""
+    found = [e for e in among if e.primitive.name == "scan" and e.params["length"] == length]
+    return [inner for e in found for inner in equations(e.params["jaxpr"].jaxpr)]
+
+
+def shapes(equations):
+    return {v.aval.shape for eqn in equations for v in eqn.outvars}
+
+
+@pytest.mark.parametrize("runs", [5, 16, 17, 97, 1000, 1024, 10_000])
+@pytest.mark.parametrize("joined", [True, False])
+def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(layout, "loops_are_joined", lambda: joined)
+    for own, shared, largest, itemsize in ((108, 4, 144, 4), (216, 8, 288, 8), (1000, 0, 700, 4)):
+        size = layout.group_size(runs, own, shared, largest, itemsize)
+        assert min(runs, 64) <= size <= runs
+        assert size * (own + shared) <= layout._SECOND_CACHE
+        assert size * largest <= layout._UNDIVIDED
+        assert -(-runs // size) * size <= 1.25 * runs
+    assert layout.group_size(runs, 10**6, 0, 10**6, 4) == 1
+
+
+def test_blocks_divide_the_steps():
+    assert [layout._block(steps) for steps in (7, 96, 97, 1000)] == [7, 16, 97, 20]
 
 
 def test_raw_and_typed_keys_are_split_over_the_runs():
