@@ -153,7 +153,9 @@ def _block(steps: int) -> int:
     return best if best >= 5 else steps
 
 
-def group_size(runs: int, own: int, shared: int, largest: int, itemsize: int) -> int:
+def group_size(
+    runs: int, own: int, shared: int, largest: int, itemsize: int, draws: bool = False
+) -> int:
     """How many runs to filter at once; 1 where a few would be too many (a state that large is a
     vector itself). What is no CPU takes all runs at once.
 
@@ -168,13 +170,14 @@ def group_size(runs: int, own: int, shared: int, largest: int, itemsize: int) ->
         shared: bytes of what all runs share.
         largest: bytes of the largest array in a run's state or in its estimate.
         itemsize: bytes of a number.
+        draws: whether a state has random members, along which it is a vector sooner.
     """
     if jax.default_backend() != "cpu":
         return runs
     room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
     if own > shared and loops_are_joined():
         room = min(room, max(_FIRST_CACHE // own, 128), 256)
-    if room < min(runs, 16):
+    if room < (32 if draws else min(runs, 16)):
         return 1
     fewest = -(-runs // room)
     sizes = [_odd_lines(-(-runs // groups), itemsize) for groups in range(fewest, 2 * fewest + 2)]

@@ -60,7 +60,8 @@ def over_runs(
     dtype = inputs[1].value.dtype
     ahead = 0 < parts.needed <= runs * m * dtype.itemsize  # no more memory than the values
     own, shared, largest = _sizes(state, differ[0], jax.eval_shape(estimate, params, state))
-    size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize)
+    draws = key is not None
+    size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize, draws)
     if ahead and 1 < size < runs:
         return _shared_ahead(loop, parts, inputs, flags, differ, size)
     return _in_groups(loop, inputs, flags, differ, size)

@@ -191,6 +191,7 @@ def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, monkeyp
         assert size * largest <= layout._UNDIVIDED
         assert -(-runs // size) * size <= 1.25 * runs
     assert layout.group_size(runs, 10**6, 0, 10**6, 4) == 1
+    assert layout.group_size(runs, 20_008, 0, 16_000, 4, draws=True) == 1
 
 
 def test_blocks_divide_the_steps():
