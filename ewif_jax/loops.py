@@ -9,17 +9,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax.dependence import Divided, Traced, dependence, divided, traced
+from ewif_jax.groups import Place, group_size, in_groups, scan_in_blocks
 from ewif_jax.layout import (
-    Place,
     first_run,
-    group_size,
-    in_groups,
     joined,
     parted,
     runs_adjacent,
     runs_first,
     runs_last,
-    scan_in_blocks,
     vmap_last,
 )
 
@@ -60,7 +57,8 @@ def over_runs(
     dtype = inputs[1].value.dtype
     ahead = 0 < parts.needed <= runs * m * dtype.itemsize  # no more memory than the values
     own, shared, largest = _sizes(state, differ[0], jax.eval_shape(estimate, params, state))
-    draws = key is not None
+    of_key = dependence(start, (_alike(params_f), _alike(prior_f), key_f))
+    draws = any(jax.tree.leaves(of_key))
     size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize, draws)
     if ahead and 1 < size < runs:
         return _shared_ahead(loop, parts, inputs, flags, differ, size)

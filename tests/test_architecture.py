@@ -17,6 +17,7 @@ RANKS = (
     {"checks"},
     {"compiling", "dependence", "kernels"},
     {"models", "layout"},
+    {"groups"},
     {"estimator", "loops"},
     {"forms", "batch"},
     {"estimators"},

@@ -7,7 +7,8 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import ewif_jax as ej
-from ewif_jax import layout, loops
+from ewif_jax import groups as grouping
+from ewif_jax import loops
 from ewif_jax import scores as scores_of
 from ewif_jax.scores import scored
 
@@ -96,28 +97,65 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(steps, shared, groups):
     np.testing.assert_allclose(found, np.sum(got.info.innovation**2, -1), rtol=1e-10)
 
 
+def in_batch(estimator, params, measurements):
+    return ej.run_batch(estimator, params, measurements, prior=PRIOR, t0=0.0)
+
+
+def one_by_one(estimator, params, measurements):
+    axes = (ej.Measurement(None, 0, None, None),)
+    return jax.vmap(lambda m: ej.run(estimator, params, m, prior=PRIOR, t0=0.0), in_axes=axes)(
+        measurements
+    )
+
+
+def loss_of(measurements, filtered):
+    """In the process noise and the values."""
+
+    def loss(q, value):
+        trace = filtered(ej.kalman(MODEL), {"q": q}, measurements._replace(value=value))
+        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
+
+    return loss
+
+
 @pytest.mark.parametrize("steps", [7, 20], ids=["one_block", "blocks"])
 def test_gradients_go_through_groups_of_runs(steps, groups):
     """In both modes, with the results of all groups in one array."""
     measurements = regular(40, steps)
+    at = 0.7, measurements.value
+    loss = loss_of(measurements, in_batch)
+    wanted, (in_q, in_values) = jax.value_and_grad(loss_of(measurements, one_by_one), (0, 1))(*at)
+    found, slopes = jax.value_and_grad(loss, (0, 1))(*at)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+    np.testing.assert_allclose(slopes[0], in_q, rtol=1e-10)
+    np.testing.assert_allclose(slopes[1], in_values, rtol=1e-9, atol=1e-12)
+    forward = jax.jvp(loss, at, (1.0, 0 * at[1]))
+    np.testing.assert_allclose(forward, (wanted, in_q), rtol=1e-10)
 
-    def loss(q, filtered):
-        trace = filtered(ej.kalman(MODEL), {"q": q}, measurements)
-        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov)
 
-    def in_batch(estimator, params, measurements):
-        return ej.run_batch(estimator, params, measurements, prior=PRIOR, t0=0.0)
+def test_reverse_mode_touches_the_whole_result_no_more_often_than_the_filter(groups):
+    """Where a group clears or adds up its part of all runs, the time grows as their square."""
+    measurements = regular(40, 20)
+    loss = loss_of(measurements, in_batch)
 
-    def one_by_one(estimator, params, measurements):
-        axes = (ej.Measurement(None, 0, None, None),)
-        return jax.vmap(lambda m: ej.run(estimator, params, m, prior=PRIOR, t0=0.0), in_axes=axes)(
-            measurements
-        )
+    def wholes(fn):
+        everywhere = equations(jax.make_jaxpr(fn)(0.7, measurements.value).jaxpr)
+        inside = within_loops(everywhere)
+        inside = [e for e in inside if e.primitive.name in ("dynamic_update_slice", "add_any")]
+        return sum(len(v.aval.shape) > 1 and v.aval.shape[0] == 40 for v in outputs(inside))
 
-    wanted = jax.value_and_grad(loss)(0.7, one_by_one)
-    np.testing.assert_allclose(jax.value_and_grad(loss)(0.7, in_batch), wanted, rtol=1e-10)
-    forward = jax.jvp(lambda q: loss(q, in_batch), (0.7,), (1.0,))
-    np.testing.assert_allclose(forward, wanted, rtol=1e-10)
+    assert wholes(loss) > 0
+    assert wholes(jax.grad(loss, (0, 1))) <= wholes(loss)
+
+
+@pytest.mark.parametrize("name", ["kalman", "ensemble"])
+def test_only_random_members_make_a_state_a_vector(name, monkeypatch):
+    estimator = {"kalman": ej.kalman(MODEL), "ensemble": ej.ensemble(MODEL, 8)}[name]
+    seen = []
+    monkeypatch.setattr(loops, "group_size", lambda *sizes: seen.append(sizes) or 5)
+    key = jax.random.key(0)  # `monte_carlo` passes one to every filter
+    ej.run_batch(estimator, {"q": 0.7}, regular(5, 3), prior=PRIOR, t0=0.0, key=key)
+    assert {draws for *_, draws in seen} == {name == "ensemble"}
 
 
 @pytest.mark.parametrize(("per_run", "packed"), [(False, (10,)), (True, (10, 24))])
@@ -169,33 +207,38 @@ def equations(jaxpr):
             yield from equations(inner)
 
 
-def within_loops(among, length):
-    """The equations of all loops of a length."""
-    found = [e for e in among if e.primitive.name == "scan" and e.params["length"] == length]
+def within_loops(among, length=None):
+    """The equations of all loops, or of those of a length."""
+    found = [e for e in among if e.primitive.name == "scan"]
+    found = [e for e in found if length in (None, e.params["length"])]
     return [inner for e in found for inner in equations(e.params["jaxpr"].jaxpr)]
 
 
+def outputs(equations):
+    return [v for eqn in equations for v in eqn.outvars]
+
+
 def shapes(equations):
-    return {v.aval.shape for eqn in equations for v in eqn.outvars}
+    return {v.aval.shape for v in outputs(equations)}
 
 
 @pytest.mark.parametrize("runs", [5, 16, 17, 97, 1000, 1024, 10_000])
 @pytest.mark.parametrize("joined", [True, False])
 def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    monkeypatch.setattr(layout, "loops_are_joined", lambda: joined)
+    monkeypatch.setattr(grouping, "loops_are_joined", lambda: joined)
     for own, shared, largest, itemsize in ((108, 4, 144, 4), (216, 8, 288, 8), (1000, 0, 700, 4)):
-        size = layout.group_size(runs, own, shared, largest, itemsize)
+        size = grouping.group_size(runs, own, shared, largest, itemsize)
         assert min(runs, 64) <= size <= runs
-        assert size * (own + shared) <= layout._SECOND_CACHE
-        assert size * largest <= layout._UNDIVIDED
+        assert size * (own + shared) <= grouping._SECOND_CACHE
+        assert size * largest <= grouping._UNDIVIDED
         assert -(-runs // size) * size <= 1.25 * runs
-    assert layout.group_size(runs, 10**6, 0, 10**6, 4) == 1
-    assert layout.group_size(runs, 20_008, 0, 16_000, 4, draws=True) == 1
+    assert grouping.group_size(runs, 10**6, 0, 10**6, 4) == 1
+    assert grouping.group_size(runs, 20_008, 0, 16_000, 4, draws=True) == 1
 
 
 def test_blocks_divide_the_steps():
-    assert [layout._block(steps) for steps in (7, 96, 97, 1000)] == [7, 16, 97, 20]
+    assert [grouping._block(steps) for steps in (7, 96, 97, 1000)] == [7, 16, 97, 20]
 
 
 def test_raw_and_typed_keys_are_split_over_the_runs():
