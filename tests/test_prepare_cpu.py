@@ -1,6 +1,7 @@
 """`prepare_cpu` changes how fast filters are, and no number."""
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 import ewif_jax as ej
 
 CHILD = """
+import resource
 import sys
 import jax
 import jax.numpy as jnp
@@ -49,6 +51,14 @@ program = jax.jit(lambda x: jax.lax.scan(lambda c, _: (jnp.sin(c) + 1, c), x, No
 text = program.lower(jnp.ones(300)).compile().as_text()
 found["whole"] = "xla_cpu_small_call" in text
 found["devices"] = len(jax.devices())
+
+large = jax.jit(lambda x: x + 1)
+arrays = [jnp.zeros(5_000_000)]
+for k in range(8):
+    if k == 3:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    arrays.append(jax.block_until_ready(large(arrays.pop())))
+found["page faults"] = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 np.savez(sys.argv[1], **found)
 """
 
@@ -66,6 +76,9 @@ def test_loops_become_one_function_and_cores_devices_and_no_number_changes(tmp_p
     assert (plain.pop("whole"), prepared.pop("whole")) == (False, True)
     assert (plain.pop("devices"), prepared.pop("devices")) == (1, 2)
     assert (plain.pop("spread"), prepared.pop("spread")) == (1, 2)
+    before, after = plain.pop("page faults"), prepared.pop("page faults")
+    if platform.libc_ver()[0] == "glibc":
+        assert after < before / 2
     # A loss over several devices would add up what each has, and their threads wait for each other.
     assert not plain.pop("waits")
     assert not prepared.pop("waits")
