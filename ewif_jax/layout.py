@@ -100,14 +100,14 @@ def on_devices(tree: Any, flags: Any, devices: int) -> Any:
         return tree
 
     mesh = _mesh(devices)
-
-    def put(x: Any, flag: bool) -> Any:
-        if isinstance(x, Tracer):
-            return x
-        spec = PartitionSpec("runs") if flag else PartitionSpec()
-        return jax.device_put(_on_host(x), NamedSharding(mesh, spec))
-
-    return jax.tree.map(put, tree, flags)
+    split, shared = (NamedSharding(mesh, spec) for spec in (PartitionSpec("runs"), PartitionSpec()))
+    leaves, structure = jax.tree.flatten(tree)
+    places = [split if flag else shared for flag in structure.flatten_up_to(flags)]
+    known = [i for i, x in enumerate(leaves) if not isinstance(x, Tracer)]
+    there = jax.device_put([_on_host(leaves[i]) for i in known], [places[i] for i in known])
+    for i, x in zip(known, there, strict=True):
+        leaves[i] = x
+    return structure.unflatten(leaves)
 
 
 def _on_host(x: Any) -> Any:
