@@ -82,6 +82,8 @@ def _table(path: Path) -> Any:
             path, dtype=str, keep_default_na=False, skip_blank_lines=False, index_col=False,
             encoding="utf-8-sig",
         )  # fmt: skip
+    except FileNotFoundError:
+        raise Refused(f"{path}: no such file") from None
     except pd.errors.EmptyDataError:
         raise Refused(f"{path}: is empty") from None
     except (pd.errors.ParserError, UnicodeDecodeError) as error:

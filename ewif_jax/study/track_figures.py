@@ -31,7 +31,8 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
         focus = row == longest
         left.plot(*place, color=KALMAN if focus else OTHER, linewidth=1.6 if focus else 0.7)
     name = found.name[longest]
-    many = f"{len(found.name)} tracks; {name} in red" if len(found.name) > 1 else "estimated track"
+    several = f"{len(found.name)} tracks; {name} highlighted"
+    many = several if len(found.name) > 1 else "estimated track"
     dims = found.measurements.value.shape[-1]
     if found.origin is not None:
         latitude = np.deg2rad(found.origin[:, 0].mean())

@@ -150,7 +150,7 @@ def test_a_column_that_is_not_there_names_those_that_are(tmp_path, capsys):
     assert run(["track", str(path), "--values", "x,z", "--out", str(tmp_path / "r")]) == 2
     assert "has no column 'z' for --values; it has time, x, y" in capsys.readouterr().err
     assert run(["track", str(tmp_path / "none.csv")]) == 2
-    assert "none.csv" in capsys.readouterr().err
+    assert "none.csv: no such file" in capsys.readouterr().err
 
 
 def test_sensors_have_their_own_noise(tmp_path, capsys):
