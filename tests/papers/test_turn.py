@@ -42,7 +42,7 @@ def computed():
 
 @pytest.fixture(scope="module")
 def results():
-    return apart(computed)
+    return apart(computed, double=False)
 
 
 @pytest.fixture(scope="module")
