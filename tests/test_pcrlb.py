@@ -210,6 +210,24 @@ def test_its_derivative_is_the_difference_quotient():
     assert np.isfinite(last(0.0)[1])
 
 
+@pytest.mark.parametrize("bound", [pcrlb, pcrlb_late, pcrlb_equivalent])
+def test_a_second_call_compiles_nothing(bound):
+    traced = []
+
+    def observe(params, x, sensor, t):
+        traced.append(bound)
+        return STRAIGHT.observe(params, x, sensor, t)
+
+    given = {"start": truth(4)(0.0), "prior_cov": COV[4], "t0": 0.0}
+    given |= {} if bound is pcrlb else {"times": TIME}
+    first, second = (
+        bound(STRAIGHT._replace(observe=observe), None, stream(), along(4, TIME), **given)
+        for observe in [observe] * 2
+    )
+    np.testing.assert_array_equal(first, second)
+    assert len(set(traced)) == 1
+
+
 def test_no_filter_beats_it():
     """The mean square error of the extended filter, bearings of a target drawn from the model."""
     runs, rng = 400, np.random.default_rng(5)

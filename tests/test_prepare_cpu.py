@@ -8,6 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from apart import FLAGS_OF_THE_TESTS, SOON_FAST
 
 import ewif_jax as ej
 from ewif_jax import compiling
@@ -64,7 +65,8 @@ np.savez(sys.argv[1], **found)
 """
 
 
-def numbers(file, how, flags=""):
+def numbers(file, how):
+    flags = SOON_FAST if FLAGS_OF_THE_TESTS in os.environ else ""
     environment = {**os.environ, "XLA_FLAGS": flags}
     command = [sys.executable, "-c", CHILD, str(file), how]
     subprocess.run(command, env=environment, check=True)

@@ -1,5 +1,7 @@
 """Errors of estimates, and whether their covariances are honest."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,12 @@ def rmse(mean: Array, truth: Array, axis: int | tuple[int, ...] | None = None) -
 
     Steps where the estimate is NaN (nothing known yet) are left out.
     """
-    error = jnp.asarray(mean)[..., : jnp.shape(truth)[-1]] - jnp.asarray(truth)
+    return _rms(jnp.asarray(mean), jnp.asarray(truth), axis)
+
+
+@partial(jax.jit, static_argnames="axis", inline=True)
+def _rms(mean: Array, truth: Array, axis: int | tuple[int, ...] | None) -> Array:
+    error = mean[..., : truth.shape[-1]] - truth
     known = jnp.all(jnp.isfinite(error), -1)
     square = jnp.sum(jnp.square(jnp.where(known[..., None], error, 0)), -1)
     count = jnp.sum(known, axis)
@@ -38,9 +45,7 @@ def nees(mean: Array, cov: Array, truth: Array) -> Array:
 
     Chi-square with k degrees of freedom (mean k) if the filter is consistent.
     """
-    k = jnp.shape(truth)[-1]
-    error = jnp.asarray(mean)[..., :k] - jnp.asarray(truth)
-    return _quadratic(error, jnp.asarray(cov)[..., :k, :k])
+    return _normalised(jnp.asarray(mean), jnp.asarray(cov), jnp.asarray(truth))
 
 
 def nis(info: Info) -> Array:
@@ -65,6 +70,13 @@ def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float
     return low, high
 
 
+@partial(jax.jit, inline=True)
+def _normalised(mean: Array, cov: Array, truth: Array) -> Array:
+    k = truth.shape[-1]
+    return _quadratic(mean[..., :k] - truth, cov[..., :k, :k])
+
+
+@partial(jax.jit, inline=True)
 def _quadratic(error: Array, cov: Array) -> Array:
     lead = error.shape[:-1]
     flat = error.reshape(-1, error.shape[-1])

@@ -1,6 +1,7 @@
 """What no unbiased estimator of a motion without noise can beat: the Cramer-Rao bound."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -63,21 +64,34 @@ def crlb(
     if information is not None:
         checks.shape("information", information, (n, n))
         checks.psd("information", information)
+        information = jnp.asarray(information, dtype)
+    return _crlb(model, weight, params, stream, state, time, information)
 
+
+@partial(jax.jit, static_argnames=("model", "weight"))
+def _crlb(
+    model: Model,
+    weight: Callable[..., Array] | None,
+    params: Any,
+    stream: Measurement,
+    state: Array,
+    time: Array,
+    information: Array | None,
+) -> Array:
     def one(measurement: Measurement) -> Array:
         sensor, mask = measurement.sensor, measurement.mask
 
         def seen(x: Array) -> Array:
             there = model.transition(params, x, time, measurement.time)
-            return jnp.asarray(model.observe(params, there, sensor, measurement.time), dtype)
+            return jnp.asarray(model.observe(params, there, sensor, measurement.time), state.dtype)
 
-        R = jnp.asarray(model.measurement_cov(params, sensor, measurement.time), dtype)
+        R = jnp.asarray(model.measurement_cov(params, sensor, measurement.time), state.dtype)
         noise = cholesky.factor(gaussian.mask_cov(R, mask))
         white = cholesky.forward(noise, jnp.where(mask[:, None], jax.jacfwd(seen)(state), 0))
         w = 1.0 if weight is None else weight(params, measurement.time, time)
         return jnp.square(w) * white.T @ white
 
     total = jnp.sum(jax.vmap(one)(stream), 0)
-    total = total if information is None else total + jnp.asarray(information, dtype)
+    total = total if information is None else total + information
     f = cholesky.factor(total)
     return jnp.where(f.full_rank, cholesky.inverse(f), jnp.nan)

@@ -1,5 +1,6 @@
 """The exact error of a linear filter along a given truth, without sampling."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -59,12 +60,17 @@ def expected_mse(
         noise = jnp.broadcast_to(noise, (steps, m, m))
     checks.shape("noise_cov", noise, (steps, m, m))
 
-    def filtered(value: Array) -> Array:
+    def filtered(value: Array) -> tuple[Array, Array]:
         stream = measurements._replace(value=value)
         trace = run(estimator, params, stream, prior=prior, t0=t0, times=times)
-        return trace.mean[:, : truth.shape[1]]
+        mean = trace.mean[:, : truth.shape[1]]
+        return mean, mean
 
-    bias = filtered(value) - truth
-    gains = jax.jacfwd(filtered)(value)
+    gains, mean = jax.jacfwd(filtered, has_aux=True)(value)
+    return _bias_and_variance(mean - truth, gains, noise)
+
+
+@partial(jax.jit, inline=True)
+def _bias_and_variance(bias: Array, gains: Array, noise: Array) -> Array:
     variance = jnp.einsum("tklm,lmn,tkln->t", gains, noise, gains)
     return jnp.sum(jnp.square(bias), -1) + variance

@@ -1,6 +1,7 @@
 """What a late measurement is still worth: its gain in the ideal filter (Yoder et al. 2018)."""
 
 import operator
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -254,6 +255,12 @@ def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> Ga
         checks.psd(f"Q[{k}]", one)
     checks.psd("R", R, definite=True)
     checks.psd("first_cov", cov)
+    return _followed(F, H, Q, R, cov, lag)
+
+
+@partial(jax.jit, static_argnames="lag")
+def _followed(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> GainHistory:
+    m, n = H.shape
     eye = jnp.eye(n, dtype=F.dtype)
 
     def body(carry: tuple, motion: tuple[Array, Array]) -> tuple[tuple, GainHistory]:

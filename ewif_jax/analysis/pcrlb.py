@@ -1,5 +1,6 @@
 """What no filter can beat: the posterior Cramer-Rao bound, with and without late measurements."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -66,15 +67,7 @@ def pcrlb(
     time = checks.known(measurements.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
-
-    def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
-        cov, before, last = carry
-        measurement, states = now
-        moved = _moved(model, params, cov, before, last, measurement.time)
-        after = _informed(moved, _information(model, params, states, measurement))
-        return (after, states, measurement.time), after
-
-    return lax.scan(body, (cov, start, t0), (stream, jnp.moveaxis(truth, 0, 1)))[1]
+    return _in_order(model, params, stream, truth, start, cov, t0)
 
 
 def pcrlb_late(
@@ -117,25 +110,10 @@ def pcrlb_late(
     arrived, truth, start, cov, t0 = _checked(
         model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
     )
-    steps = truth.shape[1]
-    checks.shape("times", times, (steps,))
+    checks.shape("times", times, (truth.shape[1],))
     checks.finite("times", times)
-    order = jnp.argsort(arrived.time, stable=True)
-    stream, states = jax.tree.map(lambda x: jnp.asarray(x)[order], (arrived, truth[0]))
-
-    def report(number: Array, time: Array) -> Array:
-        def body(carry: tuple, now: tuple) -> tuple[tuple, None]:
-            cov, before, last = carry
-            measurement, state, place = now
-            moved = _moved(model, params, cov, before, last, measurement.time)
-            after = _informed(moved, _information(model, params, state[None], measurement))
-            here = (after, state[None], measurement.time)
-            return choose((place <= number) & jnp.any(measurement.mask), here, carry), None
-
-        bound, _ = lax.scan(body, (cov, start, t0), (stream, states, order))
-        return jnp.where(time >= bound[2], _moved(model, params, *bound, time), jnp.nan)
-
-    return jax.vmap(report)(jnp.arange(steps), jnp.asarray(times, truth.dtype))
+    times = jnp.asarray(times, truth.dtype)
+    return _as_it_arrives(model, params, arrived, truth[0], start, cov, t0, times)
 
 
 def pcrlb_equivalent(
@@ -181,7 +159,70 @@ def pcrlb_equivalent(
         model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
     )
     checks.report_times(times, truth.shape[1])
+    times = jnp.asarray(times, truth.dtype)
+    return _equivalent(model, params, stream, truth[0], start, cov, t0, times)
 
+
+@partial(jax.jit, static_argnames="model")
+def _in_order(
+    model: Model,
+    params: Any,
+    stream: Measurement,
+    truth: Array,
+    start: Array,
+    cov: Array,
+    t0: Array,
+) -> Array:
+    def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
+        cov, before, last = carry
+        measurement, states = now
+        moved = _moved(model, params, cov, before, last, measurement.time)
+        after = _informed(moved, _information(model, params, states, measurement))
+        return (after, states, measurement.time), after
+
+    return lax.scan(body, (cov, start, t0), (stream, jnp.moveaxis(truth, 0, 1)))[1]
+
+
+@partial(jax.jit, static_argnames="model")
+def _as_it_arrives(
+    model: Model,
+    params: Any,
+    arrived: Measurement,
+    truth: Array,
+    start: Array,
+    cov: Array,
+    t0: Array,
+    times: Array,
+) -> Array:
+    order = jnp.argsort(arrived.time, stable=True)
+    stream, states = jax.tree.map(lambda x: x[order], (arrived, truth))
+
+    def report(number: Array, time: Array) -> Array:
+        def body(carry: tuple, now: tuple) -> tuple[tuple, None]:
+            cov, before, last = carry
+            measurement, state, place = now
+            moved = _moved(model, params, cov, before, last, measurement.time)
+            after = _informed(moved, _information(model, params, state[None], measurement))
+            here = (after, state[None], measurement.time)
+            return choose((place <= number) & jnp.any(measurement.mask), here, carry), None
+
+        bound, _ = lax.scan(body, (cov, start, t0), (stream, states, order))
+        return jnp.where(time >= bound[2], _moved(model, params, *bound, time), jnp.nan)
+
+    return jax.vmap(report)(jnp.arange(times.shape[0]), times)
+
+
+@partial(jax.jit, static_argnames="model")
+def _equivalent(
+    model: Model,
+    params: Any,
+    stream: Measurement,
+    truth: Array,
+    start: Array,
+    cov: Array,
+    t0: Array,
+    times: Array,
+) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
         measurement, state, time = now
@@ -194,8 +235,7 @@ def pcrlb_equivalent(
         after = _informed(moved, _precision(seen, spread, measurement.mask))
         return (after, state[None], time), after
 
-    reports = jnp.asarray(times, truth.dtype)
-    return lax.scan(body, (cov, start, t0), (stream, truth[0], reports))[1]
+    return lax.scan(body, (cov, start, t0), (stream, truth, times))[1]
 
 
 def _moved(model: Model, params: Any, cov: Array, states: Array, t0: Array, t1: Array) -> Array:

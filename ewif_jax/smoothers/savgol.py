@@ -1,6 +1,6 @@
 """Savitzky-Golay coefficients, as the least squares of a polynomial model."""
 
-from functools import cache
+from functools import cache, partial
 from math import factorial
 
 import jax
@@ -56,14 +56,19 @@ def savgol(
     checks.require(inside, "pos", f"a sample between 0 and {window_length - 1}", pos)
     if deriv > polyorder:
         return jnp.zeros(window_length)
-    model = _polynomial(polyorder)
-    samples = stream(np.arange(window_length) - pos, jnp.zeros(window_length))
+    return _fitted(_polynomial(polyorder), window_length, pos)[:, deriv] / delta**deriv
+
+
+@partial(jax.jit, static_argnames=("model", "window_length"))
+def _fitted(model: Model, window_length: int, pos: Array) -> Array:
+    """The state at `pos` that is fitted to one at each sample and zero at the others, (W, n)."""
+    samples = stream(jnp.arange(window_length) - pos, jnp.zeros(window_length))
 
     def fitted(value: Array) -> Array:
         window = samples._replace(value=value[:, None])
-        return batch_wls(model, None, window, jnp.zeros(1), weight=_even).mean[0, deriv]
+        return batch_wls(model, None, window, jnp.zeros(1), weight=_even).mean[0]
 
-    return jax.vmap(fitted)(jnp.eye(window_length)) / delta**deriv
+    return jax.vmap(fitted)(jnp.eye(window_length))
 
 
 @cache

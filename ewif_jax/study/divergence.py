@@ -20,6 +20,7 @@ from ewif_jax.scenarios.divergence import (
 from ewif_jax.study import divergence_figures as figures
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.folder import Arrays
+from ewif_jax.types import Estimator
 
 EPS, LENGTH = 0.3, 20.0
 GAINS = np.geomspace(0.05, 5.0, 60)
@@ -74,9 +75,14 @@ def run(experiment: Experiment) -> None:
     runs, dt = experiment.size(4000, 200), 0.1 if quick else 0.02
     time = np.arange(1, round(LENGTH / dt) + 1) * dt
     cases = list(product(PUSHES, REMEDIES))
+    filters = {r: divergence_filter(r, dt=dt, setting=chosen(r, dt)) for r in REMEDIES}
+
+    def simulated(push: Push, remedy: Remedy) -> Arrays:
+        return _simulated(experiment, push, remedy, filters[remedy], runs, dt)
+
     found = {
         (push, remedy): experiment.piece(
-            f"{push}-{remedy}", lambda p=push, r=remedy: _simulated(experiment, p, r, runs, dt)
+            f"{push}-{remedy}", lambda case=(push, remedy): simulated(*case)
         )
         for push, remedy in cases
     }
@@ -114,13 +120,18 @@ def run(experiment: Experiment) -> None:
 
 
 def _simulated(
-    experiment: Experiment, push: Push, remedy: Remedy, runs: int, dt: float
-) -> dict[str, np.ndarray]:
+    experiment: Experiment,
+    push: Push,
+    remedy: Remedy,
+    estimator: Estimator,
+    runs: int,
+    dt: float,
+) -> Arrays:
     """Mean square errors (T,) and their standard errors."""
     label = f"{push} push, {TEXT[remedy]}"
     with experiment.timed(label), experiment.progress(label) as report:
         measured = monte_carlo(
-            divergence_filter(remedy, dt=dt, setting=chosen(remedy, dt)),
+            estimator,
             None,
             divergence(push, eps=EPS, dt=dt, length=LENGTH),
             runs=runs,

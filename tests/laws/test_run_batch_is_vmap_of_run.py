@@ -87,7 +87,9 @@ def alone(steps, shared):
     params, measurements = worlds(steps, shared)
 
     def one(k):
-        own = jax.tree.map(lambda x: x[k] if np.shape(x)[:1] == (48,) else x, (params, measurements))
+        own = jax.tree.map(
+            lambda x: x[k] if np.shape(x)[:1] == (48,) else x, (params, measurements)
+        )
         return jax.device_get(ej.run(ej.kalman(MODEL), *own, prior=PRIOR, t0=0.0))
 
     return {k: one(k) for k in (0, 17, 23, 24, 40, 47)}

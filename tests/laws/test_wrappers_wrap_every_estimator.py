@@ -26,13 +26,22 @@ ESTIMATORS = {
     "pf_fixed_point": lambda: ej.pf_fixed_point(GIVEN.model, SIZE, LAG),
 }
 
+EVERY_KIND = ("ensemble", "rts_reference", "pf_fixed_point")
+"""one of every kind: random, with a history, with both"""
+
 
 def go(estimator, data, params=None):
     options = {"prior": GIVEN.prior, "t0": 0.0, "key": jax.random.key(3)}
     return ej.run(estimator, params, data, **options)
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in EVERY_KIND else pytest.mark.slow)
+        for name in ESTIMATORS
+    ],
+)
 def test_wrapped(name):
     estimator = ESTIMATORS[name]()
     plain, without, in_order = (go(estimator, data) for data in (DATA, IN_SEQUENCE, SORTED))

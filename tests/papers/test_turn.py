@@ -23,10 +23,18 @@ REFERENCE = {
     runs_of.PS: ((74.0, 1.7), (26.7, 0.5)),
 }
 """independently computed: RMS of position and velocity with their standard errors"""
-SMOOTHED = (runs_of.EKS, runs_of.UKS, runs_of.PS)
+SLOW = (runs_of.UKS, runs_of.PS, runs_of.EXACT)
+"""what only the slow tests compare"""
+LATE = (runs_of.EXT, runs_of.EKS, runs_of.UKS, runs_of.PS)
 
 
-def computed():
+def named(*names):
+    """Parametrised by the names of methods."""
+    marks = {name: pytest.mark.slow if name in SLOW else () for name in names}
+    return pytest.mark.parametrize("name", [pytest.param(n, marks=m) for n, m in marks.items()])
+
+
+def computed(left_out):
     """What every method finds, and the bounds."""
     batches = runs_of.simulated(jax.random.key(7), RUNS)
     own = jax.random.split(jax.random.key(8), RUNS)
@@ -36,13 +44,14 @@ def computed():
         some = jax.tree.map(lambda x: x[:runs], batches[method.in_order])
         return runs_of.followed(method, some, own[:runs])
 
-    found = {name: followed(name, method) for name, method in runs_of.methods(10_000).items()}
+    every = {name: x for name, x in runs_of.methods(10_000).items() if name not in left_out}
+    found = {name: followed(name, method) for name, method in every.items()}
     return found, runs_of.bounds(batches[False])
 
 
 @pytest.fixture(scope="module")
-def results():
-    return apart(computed, double=False)
+def results(pytestconfig):
+    return apart(computed, () if pytestconfig.getoption("--all") else SLOW)
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +73,14 @@ def off(found, name, runs=RUNS):
     return study.settled(found[name])[:runs]
 
 
-@pytest.mark.parametrize("name", REFERENCE)
+@named(*REFERENCE)
 def test_errors_are_those_of_an_independent_computation(found, name):
     for kind, (value, error) in zip(("position", "velocity"), REFERENCE[name], strict=True):
         ours = rmse(study.settled(found[name], kind))
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, error)
 
 
-@pytest.mark.parametrize("name", [runs_of.EKS, runs_of.UKS, runs_of.PS, runs_of.EXT])
+@named(*LATE)
 def test_late_measurements_help_and_in_time_they_would_help_more(found, name):
     runs = FEW.get(name, RUNS)
     for better, worse in ((name, runs_of.STD), (runs_of.ORD, name)):
@@ -79,7 +88,7 @@ def test_late_measurements_help_and_in_time_they_would_help_more(found, name):
         assert gain.value + 3 * gain.error < 1
 
 
-@pytest.mark.parametrize("name", SMOOTHED)
+@named(runs_of.EKS, runs_of.UKS, runs_of.PS)
 def test_what_stores_no_particles_is_as_good_as_what_does(found, held, name):
     """Over 320 runs the ratio of EKS to EXT is 1.008, 0.995 to 1.024."""
     runs = FEW.get(name, RUNS)
@@ -89,21 +98,25 @@ def test_what_stores_no_particles_is_as_good_as_what_does(found, held, name):
     assert extra[name] < extra[runs_of.EXT] / 1000
 
 
-@pytest.mark.parametrize("name", [*SMOOTHED, runs_of.EXT])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LATE)
 def test_what_uses_late_data_is_as_good_as_exact_replay(found, name):
     runs = FEW[runs_of.EXACT]
     same = ratio(off(found, name, runs), off(found, runs_of.EXACT, runs))
     assert abs(same.value - 1) < 3 * same.error + 0.02
 
 
-def test_every_late_measurement_is_used_but_for_a_few_that_are_rejected(found):
-    for name in (runs_of.EXT, *SMOOTHED, runs_of.EXACT):
-        assert found[name]["too_late"].sum() == 0
-        assert 19 < found[name]["late_used"].mean() < 23
-        assert found[name]["rejected"].mean() < 0.5
-    for name in (runs_of.STD, runs_of.EKF, runs_of.UKF):
-        assert found[name]["late_used"].sum() == 0
-        assert found[name]["too_late"].sum() > 0
+@named(*LATE, runs_of.EXACT)
+def test_every_late_measurement_is_used_but_for_a_few_that_are_rejected(found, name):
+    assert found[name]["too_late"].sum() == 0
+    assert 19 < found[name]["late_used"].mean() < 23
+    assert found[name]["rejected"].mean() < 0.5
+
+
+@named(runs_of.STD, runs_of.EKF, runs_of.UKF)
+def test_what_cannot_use_late_measurements_drops_them(found, name):
+    assert found[name]["late_used"].sum() == 0
+    assert found[name]["too_late"].sum() > 0
 
 
 def test_one_gaussian_is_lost_early_and_found_again(found):
@@ -143,6 +156,7 @@ DECIDED = {
 """by so few runs; the others differ by about one per cent, or in single seconds"""
 
 
+@pytest.mark.slow
 def test_the_claims(found, bound, held):
     rows = {(row["claim"], row["published"]): row for row in study.claims(found, bound, held)}
     assert len(rows) == 16

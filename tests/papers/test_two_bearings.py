@@ -25,17 +25,19 @@ LOST = {runs_of.PF: (0.07, 0.23, 0.60), runs_of.HALF: (0.22, 0.51, 0.79)}
 particles"""
 
 
-def computed():
+def computed(left_out):
     """The times of a world (D, T), what every method finds in it, and its bounds."""
     world = runs_of.simulated(jax.random.key(2), 60)
-    every = runs_of.methods(10_000)
+    every = {name: x for name, x in runs_of.methods(10_000).items() if name not in left_out}
     found = {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
     return world.times, found, runs_of.bounds(world)
 
 
 @pytest.fixture(scope="module")
-def results():
-    return apart(computed, double=False)
+def results(pytestconfig):
+    """Particles, which take longer than all the rest, for the slow tests only."""
+    left_out = () if pytestconfig.getoption("--all") else tuple(LOST)
+    return apart(computed, left_out, double=False)
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,7 @@ def test_dropping_what_is_late_loses_the_target(found):
         assert study.lost(found[name]["error"])[: FIVE + 1].mean() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOST)
 def test_retrodicted_particles_get_lost_the_more_the_longer_the_delay(found, name):
     gone = study.lost(found[name]["error"])
@@ -143,6 +146,7 @@ def test_one_sensor_alone_loses_the_target(found):
         assert (gone.mean(1) > 0.7).all()
 
 
+@pytest.mark.slow
 def test_the_claims(times, found, bound):
     """Each is decided by so few runs, but for one that hangs on 2 or 3 %."""
     rows = {row["claim"]: row for row in study.claims(found, bound, times)}
