@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 STUDY := .venv/.study
 DEV := .venv/.dev
+# Modules are compiled when they are first imported: most of what is installed never is.
+PIP := $(BIN)/python -m pip install --quiet --no-compile
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test test-all lint types check bench reproduce clean
@@ -29,7 +31,7 @@ reproduce: $(STUDY)  ## every published experiment at full size
 	$(BIN)/ewif-jax study all --overwrite
 
 bench: $(DEV)
-	$(BIN)/python -m pip install --quiet -e ".[bench]"
+	$(PIP) -e ".[bench]"
 	$(BIN)/python -m benchmarks.bench_linear
 
 $(BIN)/python:
@@ -37,11 +39,11 @@ $(BIN)/python:
 	$(PYTHON) -m venv .venv
 
 $(STUDY): $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install --quiet -e ".[study]"
+	$(PIP) -e ".[study]"
 	touch $@
 
 $(DEV): $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install --quiet -e ".[dev]"
+	$(PIP) -e ".[dev]"
 	touch $@ $(STUDY)
 
 clean:

@@ -52,7 +52,7 @@ def test_products_are_the_dense_ones(name, per_run):
     found = jax.jit(jax.vmap(all_of, (0 if per_run else None, 0, 0, 0)))(a, cov, plus, x)
     moved = a @ cov @ np.swapaxes(a, -1, -2)
     wanted = moved, moved + plus, a[..., :2, :] @ cov, (a @ x[..., None])[..., 0], a @ cov
-    one = all_of(a[0] if per_run else a, cov[0], plus[0], x[0])
+    one = jax.jit(all_of)(a[0] if per_run else a, cov[0], plus[0], x[0])
     for got, alone, exact in zip(found, one, wanted, strict=True):
         np.testing.assert_allclose(got, exact, atol=1e-12)
         np.testing.assert_allclose(alone, exact[0], atol=1e-12)
@@ -77,9 +77,8 @@ def test_gradients_are_those_of_the_dense_product(per_run):
         return jnp.sum(jnp.sin(run(a, packed)))
 
     for derivative in (jax.jacrev, jax.jacfwd):
-        sparse, dense = (
-            derivative(partial(loss, where), (0, 1))(a, cov) for where in (pattern(flags), None)
-        )
+        slope = jax.jit(derivative(loss, (1, 2)), static_argnums=0)
+        sparse, dense = (slope(where, a, cov) for where in (pattern(flags), None))
         np.testing.assert_allclose(sparse[0], np.where(flags, dense[0], 0), atol=1e-12)
         np.testing.assert_allclose(sparse[1], dense[1], atol=1e-12)
 

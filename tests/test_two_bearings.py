@@ -19,7 +19,7 @@ def exact():
     and its path at those times."""
     scenario = two_bearings(5.0, q=WILD, noise_sd=0.0)
     batch = ej.simulate_batch(scenario, KEYS)
-    path = jax.vmap(lambda key, time: two_bearings_path(key, time, q=WILD))
+    path = jax.jit(jax.vmap(lambda key, time: two_bearings_path(key, time, q=WILD)))
     return batch, np.asarray(path(KEYS, batch.measurements.time)), path
 
 

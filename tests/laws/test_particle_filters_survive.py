@@ -167,7 +167,8 @@ def test_a_target_that_passes_through_a_bearing_sensor(name):
     assert np.abs(error / np.sqrt(np.diagonal(trace.cov[-1]))).max() < 4
     standing = ej.Gaussian(np.zeros(4), np.zeros((4, 4)))
     method = BUILD[name](model._replace(process_cov=lambda p, t0, t1: jnp.zeros((4, 4))), 10)
-    on_it, info = ej.step(method, None, method.init(None, standing, 0.0, KEY), measured(0.0, 0.01))
+    step = jax.jit(lambda state, z: ej.step(method, None, state, z))
+    on_it, info = step(method.init(None, standing, 0.0, KEY), measured(0.0, 0.01))
     assert info.status == Status.USED
     np.testing.assert_allclose(info.innovation, 0.01)
     np.testing.assert_array_equal(method.estimate(None, on_it).mean, 0)
