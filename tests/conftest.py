@@ -72,7 +72,7 @@ def _room_for_compiled_programs():
 
 
 def pytest_addoption(parser):
-    parser.addoption("--all", action="store_true", help="also what is slow and covered otherwise")
+    parser.addoption("--all", action="store_true", help="also the slow tests")
 
 
 def pytest_configure(config):
@@ -82,15 +82,15 @@ def pytest_configure(config):
         if FLAGS_OF_THE_TESTS not in os.environ:  # the workers of xdist inherit them
             os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + added
             os.environ[FLAGS_OF_THE_TESTS] = added
-    config.addinivalue_line("markers", "slow: covered by faster tests too; run with --all")
+    what = "slow: of full size, or covered by faster tests too; run with --all"
+    config.addinivalue_line("markers", what)
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(config, items):
-    """Leaves out what is slow and covered otherwise, unless `--all`. With `--dist loadgroup`, tests
-    that share what they compile run in one process: those of a file, or in tests/contracts those of
-    an estimator. The longest groups of the last files come first, lest one process waits for the
-    other at the end."""
+    """Leaves out what is slow, unless `--all`. With `--dist loadgroup`, tests that share what they
+    compile run in one process: those of a file, or in tests/contracts those of an estimator. The
+    longest groups of the last files come first, lest one process waits for the other at the end."""
     if not config.getoption("--all"):
         left_out = [item for item in items if _slow(item)]
         config.hook.pytest_deselected(items=left_out)
