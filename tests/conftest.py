@@ -54,8 +54,9 @@ LONGEST = (
     "test_float32",
     "test_pcrlb",
     "test_late_studies",
-    "test_turn",
     "test_two_bearings",
+    "test_prepare_cpu",
+    "test_track",
 )
 MAPS = Path("/proc/self/maps")
 _tests = itertools.count(1)

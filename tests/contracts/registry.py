@@ -197,6 +197,7 @@ ROWS = (
         any_age=True,
         accepts_no_prior=True,
         predicts_back=True,
+        variant=True,
     ),
 )
 

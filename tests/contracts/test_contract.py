@@ -28,6 +28,13 @@ from contracts.registry import (
 from ewif_jax import Estimator, Gaussian, Info, Measurement, Status, run, step
 
 each = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+AS_IT_IS = ("kalman", "ewif", "extended", "ensemble", "al1", "replay", "pf_extended")
+"""Whose hundreds of operations are also compiled one by one; the others' with --all."""
+some = pytest.mark.parametrize(
+    "row",
+    [pytest.param(row, marks=() if row.name in AS_IT_IS else pytest.mark.slow) for row in ROWS],
+    ids=lambda row: row.name,
+)
 both_dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
 
@@ -156,7 +163,7 @@ def test_float32_is_close_to_float64(row):
         np.testing.assert_allclose(single.infos[k].log_likelihood, expected, rtol=1e-4, atol=1e-4)
 
 
-@each
+@some
 def test_jit_is_eager(row):
     state, z = streamed(row).states[6], arrival(6)
     eager = step(built(row).estimator, PARAMS, state, z)

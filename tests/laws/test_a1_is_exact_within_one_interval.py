@@ -19,7 +19,10 @@ def one_late_per_interval(rng, count):
     return np.concatenate([grid[:1], np.stack([grid[1:], late], 1).ravel()])
 
 
-@pytest.mark.parametrize(("n", "m", "rank"), [(1, 1, None), (3, 2, 1), (4, 1, None), (6, 2, None)])
+@pytest.mark.parametrize(
+    ("n", "m", "rank"),
+    [(1, 1, None), (3, 2, 1), (4, 1, None), pytest.param(6, 2, None, marks=pytest.mark.slow)],
+)
 def test_a1_and_al1_are_exact(n, m, rank):
     given = problem(10 + n, n, m, rank)
     rng = np.random.default_rng(n)

@@ -17,7 +17,9 @@ def shuffled(rng, count):
     return times[np.argsort(times + rng.exponential(1.5, count))]
 
 
-@pytest.mark.parametrize(("n", "m", "rank"), [(1, 1, None), (4, 2, 2), (6, 2, None)])
+@pytest.mark.parametrize(
+    ("n", "m", "rank"), [(1, 1, None), (4, 2, 2), pytest.param(6, 2, None, marks=pytest.mark.slow)]
+)
 def test_asd_and_replay_are_exact(n, m, rank):
     given = problem(n, n, m, rank)
     rng = np.random.default_rng(n)
@@ -35,7 +37,10 @@ def test_asd_and_replay_are_exact(n, m, rank):
 
 
 @pytest.mark.parametrize("affine", [False, True], ids=["orthogonal", "affine"])
-@pytest.mark.parametrize(("n", "seed"), [(3, 0), (3, 1), (4, 2), (4, 3)])
+@pytest.mark.parametrize(
+    ("n", "seed"),
+    [(3, 0), (4, 2), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((3, 1), (4, 3)))],
+)
 def test_asd_is_exact_where_one_noise_drives_a_chain(n, seed, affine):
     """Integrators in axes that mix them, at intervals from 0.02 to 1: the smallest variance of the
     process noise of an interval is far below the rounding of its largest."""

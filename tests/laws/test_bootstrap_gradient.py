@@ -83,6 +83,7 @@ def test_its_variance_grows_faster_than_the_square_of_the_number_of_steps(name):
     assert 2 + error < power < 4
 
 
+@pytest.mark.slow
 def test_its_bias_is_of_order_one_over_the_number_of_particles():
     """Of the derivative by r after 12 steps: four times as much with a quarter of the particles."""
     expected = slopes(ej.kalman(MODEL), 12, None)["r"][-1]

@@ -51,7 +51,9 @@ FILTERS = {
     "enkf2_shared": enkf2(MODEL, 3, 3, "shared"),
 }
 IN_SEQUENCE_ONLY = ("extended", "unscented", "two_members", "fewer_members_than_states")
-each = pytest.mark.parametrize("name", FILTERS)
+each = pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if x == "enkf2" else ()) for x in FILTERS]
+)
 PARAMS = {"q": 0.3, "r": 0.1, "blind": -1.0}
 PRIOR = ej.Gaussian(np.array([-4.0, 0.1, 0.5, -0.2]), np.diag([0.5, 0.5, 0.1, 0.1]))
 AT_THE_SENSOR = ej.Gaussian(np.zeros(4), np.zeros((4, 4)))

@@ -11,6 +11,7 @@ from ewif_jax.study import turn_runs as runs_of
 from ewif_jax.study.claims import ratio
 from ewif_jax.study.late import mean_of, rmse
 
+pytestmark = pytest.mark.slow  # tests/study/test_turn_study.py runs every method, smaller
 RUNS = 24
 FEW = {runs_of.PS: 12, runs_of.EXACT: 3}
 """what takes long is given fewer of the runs"""
@@ -23,18 +24,10 @@ REFERENCE = {
     runs_of.PS: ((74.0, 1.7), (26.7, 0.5)),
 }
 """independently computed: RMS of position and velocity with their standard errors"""
-SLOW = (runs_of.UKS, runs_of.PS, runs_of.EXACT)
-"""what only the slow tests compare"""
-LATE = (runs_of.EXT, runs_of.EKS, runs_of.UKS, runs_of.PS)
+SMOOTHED = (runs_of.EKS, runs_of.UKS, runs_of.PS)
 
 
-def named(*names):
-    """Parametrised by the names of methods."""
-    marks = {name: pytest.mark.slow if name in SLOW else () for name in names}
-    return pytest.mark.parametrize("name", [pytest.param(n, marks=m) for n, m in marks.items()])
-
-
-def computed(left_out):
+def computed():
     """What every method finds, and the bounds."""
     batches = runs_of.simulated(jax.random.key(7), RUNS)
     own = jax.random.split(jax.random.key(8), RUNS)
@@ -44,14 +37,13 @@ def computed(left_out):
         some = jax.tree.map(lambda x: x[:runs], batches[method.in_order])
         return runs_of.followed(method, some, own[:runs])
 
-    every = {name: x for name, x in runs_of.methods(10_000).items() if name not in left_out}
-    found = {name: followed(name, method) for name, method in every.items()}
+    found = {name: followed(name, method) for name, method in runs_of.methods(10_000).items()}
     return found, runs_of.bounds(batches[False])
 
 
 @pytest.fixture(scope="module")
-def results(pytestconfig):
-    return apart(computed, () if pytestconfig.getoption("--all") else SLOW)
+def results():
+    return apart(computed)
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +65,14 @@ def off(found, name, runs=RUNS):
     return study.settled(found[name])[:runs]
 
 
-@named(*REFERENCE)
+@pytest.mark.parametrize("name", REFERENCE)
 def test_errors_are_those_of_an_independent_computation(found, name):
     for kind, (value, error) in zip(("position", "velocity"), REFERENCE[name], strict=True):
         ours = rmse(study.settled(found[name], kind))
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, error)
 
 
-@named(*LATE)
+@pytest.mark.parametrize("name", [runs_of.EKS, runs_of.UKS, runs_of.PS, runs_of.EXT])
 def test_late_measurements_help_and_in_time_they_would_help_more(found, name):
     runs = FEW.get(name, RUNS)
     for better, worse in ((name, runs_of.STD), (runs_of.ORD, name)):
@@ -88,7 +80,7 @@ def test_late_measurements_help_and_in_time_they_would_help_more(found, name):
         assert gain.value + 3 * gain.error < 1
 
 
-@named(runs_of.EKS, runs_of.UKS, runs_of.PS)
+@pytest.mark.parametrize("name", SMOOTHED)
 def test_what_stores_no_particles_is_as_good_as_what_does(found, held, name):
     """Over 320 runs the ratio of EKS to EXT is 1.008, 0.995 to 1.024."""
     runs = FEW.get(name, RUNS)
@@ -98,25 +90,21 @@ def test_what_stores_no_particles_is_as_good_as_what_does(found, held, name):
     assert extra[name] < extra[runs_of.EXT] / 1000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LATE)
+@pytest.mark.parametrize("name", [*SMOOTHED, runs_of.EXT])
 def test_what_uses_late_data_is_as_good_as_exact_replay(found, name):
     runs = FEW[runs_of.EXACT]
     same = ratio(off(found, name, runs), off(found, runs_of.EXACT, runs))
     assert abs(same.value - 1) < 3 * same.error + 0.02
 
 
-@named(*LATE, runs_of.EXACT)
-def test_every_late_measurement_is_used_but_for_a_few_that_are_rejected(found, name):
-    assert found[name]["too_late"].sum() == 0
-    assert 19 < found[name]["late_used"].mean() < 23
-    assert found[name]["rejected"].mean() < 0.5
-
-
-@named(runs_of.STD, runs_of.EKF, runs_of.UKF)
-def test_what_cannot_use_late_measurements_drops_them(found, name):
-    assert found[name]["late_used"].sum() == 0
-    assert found[name]["too_late"].sum() > 0
+def test_every_late_measurement_is_used_but_for_a_few_that_are_rejected(found):
+    for name in (runs_of.EXT, *SMOOTHED, runs_of.EXACT):
+        assert found[name]["too_late"].sum() == 0
+        assert 19 < found[name]["late_used"].mean() < 23
+        assert found[name]["rejected"].mean() < 0.5
+    for name in (runs_of.STD, runs_of.EKF, runs_of.UKF):
+        assert found[name]["late_used"].sum() == 0
+        assert found[name]["too_late"].sum() > 0
 
 
 def test_one_gaussian_is_lost_early_and_found_again(found):
@@ -156,7 +144,6 @@ DECIDED = {
 """by so few runs; the others differ by about one per cent, or in single seconds"""
 
 
-@pytest.mark.slow
 def test_the_claims(found, bound, held):
     rows = {(row["claim"], row["published"]): row for row in study.claims(found, bound, held)}
     assert len(rows) == 16

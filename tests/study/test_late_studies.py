@@ -108,6 +108,7 @@ def test_order_of_the_arbitrary_targets_regimes():
         assert difference.value < -4 * difference.error
 
 
+@pytest.mark.slow
 def test_what_the_extended_filter_gains_up_to_5_seconds():
     """Arrowhead: RMSE 15.79 +- 0.04 with everything; most of what dropping costs is back at 5 s."""
     scenario = arrowhead_ekf(steps=2000)
