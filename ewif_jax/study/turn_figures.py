@@ -79,17 +79,19 @@ def pareto(
     """Error against time on one core; the area of a mark grows with the numbers stored."""
     figure, axes = canvas(width=9, height=5)
     costs = {name: found[name]["core_seconds"].mean() for name in LOOK}
-    for k, name in enumerate(sorted(LOOK, key=lambda name: costs[name])):
+    for name in sorted(LOOK, key=lambda name: costs[name]):
         color, (value, error) = LOOK[name][0], errors[name]
         axes.errorbar(costs[name], value, 2 * error, color=color, capsize=2, linewidth=1)
         area = 60 * held[name] / held["PFstd"]
-        axes.scatter(costs[name], value, area, color=color, alpha=0.6, linewidth=0)
-        axes.annotate(
-            f"{name}: {held[name]:,}", (costs[name], value), xytext=(9, 9 - 24 * (k % 2)),
-            textcoords="offset points", fontsize="small", color=color,
+        axes.scatter(
+            costs[name], value, area, color=color, alpha=0.6, linewidth=0,
+            label=f"{name}: {held[name]:,}",
         )  # fmt: skip
     axes.set_xscale("log")
-    axes.margins(x=0.3)
+    axes.legend(
+        frameon=False, fontsize="small", title="numbers stored", loc="center left",
+        bbox_to_anchor=(1, 0.5),
+    )  # fmt: skip
     label(axes, "seconds per run on one core", "RMS position error [m]",
           "Error ± 2 s.e., time, and numbers stored (area)")  # fmt: skip
     return figure

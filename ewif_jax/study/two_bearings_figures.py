@@ -72,6 +72,10 @@ def errors(
         label(axes[1, column], "time [s]", f"|error of {axis}| [m]", f"Absolute error of {axis}")
     for row in axes:
         row[0].set_yscale("log")
+    least = np.nanmin(np.median(np.sqrt(bound["right"][at]), 0)) / 10
+    most = max(np.nanmax(line.get_ydata()) for one in axes[0] for line in one.lines) * 1.5
+    axes[0, 0].set_ylim(max(axes[0, 0].get_ylim()[0], least), most)  # collapsed particles: below
+    for row in axes:
         plain_ticks(row[0])
     figure.legend(frameon=False, fontsize="small", ncols=5, loc="outside upper center")
     return figure
