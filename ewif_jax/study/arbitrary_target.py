@@ -1,7 +1,6 @@
 """Fig. 2 of Shulami & Sigalov: one EWIF as filter and as smoother, with and without the late
 sensor; and the estimate that looks both ways."""
 
-from functools import cache
 from typing import Any
 
 import jax
@@ -32,8 +31,6 @@ REGIMES = {
     "smoother (1 s), late ones too": (1.0, True),
 }
 """lag in seconds, and whether the late sensor is used"""
-scenario_of = cache(arbitrary_target)
-"""one object for each regime, so that nothing is compiled again"""
 
 
 def run(experiment: Experiment) -> None:
@@ -85,7 +82,7 @@ def smoothed(key: jax.Array, runs: int, taus: np.ndarray) -> dict[str, np.ndarra
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(runs))
     found = {}
     for name, lag in (("filter", 0.0), ("fixed lag", LAG)):
-        batch = simulate_batch(scenario_of(lag, True), keys)
+        batch = simulate_batch(arbitrary_target(lag), keys)
         swept = sweep(estimator, {"tau": taus}, batch, prior=None, t0=0.0)
         found[name] = swept["squared_error"]
     found["two-sided"] = np.stack([two_sided.two_sided_errors(model, t, batch) for t in taus])
@@ -95,7 +92,7 @@ def smoothed(key: jax.Array, runs: int, taus: np.ndarray) -> dict[str, np.ndarra
 def _errors(
     experiment: Experiment, estimator: Estimator, name: str, runs: int
 ) -> dict[str, np.ndarray]:
-    scenario = scenario_of(*REGIMES[name])
+    scenario = arbitrary_target(*REGIMES[name])
     with experiment.timed(name), experiment.progress(name) as report:
         return monte_carlo(
             estimator, {"tau": jnp.asarray(TAU)}, scenario, runs=runs, key=experiment.key(0),
@@ -109,7 +106,7 @@ def _example(experiment: Experiment, estimator: Estimator) -> dict[str, Any]:
     with experiment.timed("one realisation"):
         key = experiment.key(1)
         for name, (lag, late) in REGIMES.items():
-            one = scenario_of(lag, late).simulate(key)
+            one = arbitrary_target(lag, late).simulate(key)
             trace = run_filter(
                 estimator, {"tau": jnp.asarray(TAU)}, one.measurements, prior=None, t0=0.0,
                 times=one.times,
