@@ -215,17 +215,17 @@ def test_a_second_call_compiles_nothing(bound):
     traced = []
 
     def observe(params, x, sensor, t):
-        traced.append(bound)
+        traced.append(x)
         return STRAIGHT.observe(params, x, sensor, t)
 
     given = {"start": truth(4)(0.0), "prior_cov": COV[4], "t0": 0.0}
     given |= {} if bound is pcrlb else {"times": TIME}
-    first, second = (
-        bound(STRAIGHT._replace(observe=observe), None, stream(), along(4, TIME), **given)
-        for observe in [observe] * 2
-    )
+    model = STRAIGHT._replace(observe=observe)
+    first = bound(model, None, stream(), along(4, TIME), **given)
+    once = len(traced)
+    second = bound(model, None, stream(), along(4, TIME), **given)
     np.testing.assert_array_equal(first, second)
-    assert len(set(traced)) == 1
+    assert len(traced) == once > 0
 
 
 def test_no_filter_beats_it():

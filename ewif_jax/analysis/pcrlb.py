@@ -15,6 +15,9 @@ from ewif_jax.kernels.small import matmul
 from ewif_jax.models import Model, flow, sight
 from ewif_jax.types import Measurement
 
+Bound = tuple[Array, Array, Array]
+"""What the recursions carry: the bound (n, n), the true states (R, n) and the time () it is for."""
+
 
 def pcrlb(
     model: Model,
@@ -63,11 +66,11 @@ def pcrlb(
     """
     many = jnp.ndim(truth) == 3
     truth, start = (x if many else jnp.asarray(x)[None] for x in (truth, start))
-    stream, truth, start, cov, t0 = _checked(model, measurements, truth, start, prior_cov, t0)
+    stream, truth, first = _checked(model, measurements, truth, start, prior_cov, t0)
     time = checks.known(measurements.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
-    return _in_order(model, params, stream, truth, start, cov, t0)
+    return _in_order(model, params, stream, truth, first)
 
 
 def pcrlb_late(
@@ -107,13 +110,13 @@ def pcrlb_late(
     Raises:
         ValueError: as in `pcrlb`, except that measurement times may go back.
     """
-    arrived, truth, start, cov, t0 = _checked(
+    arrived, truth, first = _checked(
         model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
     )
     checks.shape("times", times, (truth.shape[1],))
     checks.finite("times", times)
     times = jnp.asarray(times, truth.dtype)
-    return _as_it_arrives(model, params, arrived, truth[0], start, cov, t0, times)
+    return _as_it_arrives(model, params, arrived, truth[0], first, times)
 
 
 def pcrlb_equivalent(
@@ -155,24 +158,16 @@ def pcrlb_equivalent(
     Raises:
         ValueError: as in `pcrlb_late`; report times that go back.
     """
-    stream, truth, start, cov, t0 = _checked(
+    stream, truth, first = _checked(
         model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
     )
     checks.report_times(times, truth.shape[1])
     times = jnp.asarray(times, truth.dtype)
-    return _equivalent(model, params, stream, truth[0], start, cov, t0, times)
+    return _equivalent(model, params, stream, truth[0], first, times)
 
 
 @partial(jax.jit, static_argnames="model")
-def _in_order(
-    model: Model,
-    params: Any,
-    stream: Measurement,
-    truth: Array,
-    start: Array,
-    cov: Array,
-    t0: Array,
-) -> Array:
+def _in_order(model: Model, params: Any, stream: Measurement, truth: Array, first: Bound) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
         measurement, states = now
@@ -180,19 +175,12 @@ def _in_order(
         after = _informed(moved, _information(model, params, states, measurement))
         return (after, states, measurement.time), after
 
-    return lax.scan(body, (cov, start, t0), (stream, jnp.moveaxis(truth, 0, 1)))[1]
+    return lax.scan(body, first, (stream, jnp.moveaxis(truth, 0, 1)))[1]
 
 
 @partial(jax.jit, static_argnames="model")
 def _as_it_arrives(
-    model: Model,
-    params: Any,
-    arrived: Measurement,
-    truth: Array,
-    start: Array,
-    cov: Array,
-    t0: Array,
-    times: Array,
+    model: Model, params: Any, arrived: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
     order = jnp.argsort(arrived.time, stable=True)
     stream, states = jax.tree.map(lambda x: x[order], (arrived, truth))
@@ -206,7 +194,7 @@ def _as_it_arrives(
             here = (after, state[None], measurement.time)
             return choose((place <= number) & jnp.any(measurement.mask), here, carry), None
 
-        bound, _ = lax.scan(body, (cov, start, t0), (stream, states, order))
+        bound, _ = lax.scan(body, first, (stream, states, order))
         return jnp.where(time >= bound[2], _moved(model, params, *bound, time), jnp.nan)
 
     return jax.vmap(report)(jnp.arange(times.shape[0]), times)
@@ -214,14 +202,7 @@ def _as_it_arrives(
 
 @partial(jax.jit, static_argnames="model")
 def _equivalent(
-    model: Model,
-    params: Any,
-    stream: Measurement,
-    truth: Array,
-    start: Array,
-    cov: Array,
-    t0: Array,
-    times: Array,
+    model: Model, params: Any, stream: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
@@ -235,7 +216,7 @@ def _equivalent(
         after = _informed(moved, _precision(seen, spread, measurement.mask))
         return (after, state[None], time), after
 
-    return lax.scan(body, (cov, start, t0), (stream, truth, times))[1]
+    return lax.scan(body, first, (stream, truth, times))[1]
 
 
 def _moved(model: Model, params: Any, cov: Array, states: Array, t0: Array, t1: Array) -> Array:
@@ -280,8 +261,9 @@ def _informed(cov: Array, information: Array) -> Array:
 
 def _checked(
     model: Model, measurements: Measurement, truth: Any, start: Any, prior_cov: Any, t0: Any
-) -> tuple[Measurement, Array, Array, Array, Array]:
-    """Everything in the float dtype of the truth (R, T, n), after what can be known is checked."""
+) -> tuple[Measurement, Array, Bound]:
+    """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
+    truth, after what can be known is checked."""
     checks.stream(measurements)
     checks.sensors(measurements, model.sensors)
     steps = jnp.shape(measurements.time)[0]
@@ -298,4 +280,4 @@ def _checked(
     checks.require(after, "measurements.time", f"times from t0 = {begin} on", time)
     dtype = float_dtype(truth)
     truth, start, cov, t0 = (jnp.asarray(x, dtype) for x in (truth, start, prior_cov, t0))
-    return cast(measurements, dtype), truth, start, cov, t0
+    return cast(measurements, dtype), truth, (cov, start, t0)
