@@ -100,10 +100,10 @@ def run(
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
-    dtype = float_dtype(measurements.value)
-    measurements, prior = cast(measurements, dtype), _prior(prior, dtype)
-    filtered = _compiled(measurements.time.shape[0], state, key)
-    return filtered(estimator, params, measurements, prior, t0, times, clock, key)
+    fields: list[Any] = [x if hasattr(x, "dtype") else np.asarray(x) for x in measurements]
+    prior = _prior(prior, float_dtype(measurements.value))
+    filtered = _compiled(fields[0].shape[0], state, key)
+    return filtered(estimator, params, Measurement(*fields), prior, t0, times, clock, key)
 
 
 def validated(
@@ -202,19 +202,20 @@ def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurem
         sensor: index or (T,) indices; default sensor 0.
         mask: (T,) or (T, m) bool; default: where `value` is finite.
     """
-    value = jnp.asarray(value)
+    # What JAX does not have yet needs no programs of JAX.
+    xp = jnp if any(isinstance(x, Array) for x in (time, value, sensor, mask)) else np
+    value = xp.asarray(value)
     value = value[:, None] if value.ndim == 1 else value
     checks.shape("value", value, ("T", "m"))
     dtype = float_dtype(value)
-    if mask is None:
-        mask = jnp.isfinite(value)
-    mask = jnp.asarray(mask, bool)
-    mask = jnp.broadcast_to(mask[:, None] if mask.ndim == 1 else mask, value.shape)
+    mask = xp.isfinite(value) if mask is None else xp.asarray(mask, bool)
+    mask = xp.broadcast_to(mask[:, None] if mask.ndim == 1 else mask, value.shape)
     checks.shape("time", time, (value.shape[0],))
     checks.resolvable(time, dtype)
-    sensor = jnp.broadcast_to(jnp.asarray(sensor, jnp.int32), value.shape[:1])
+    sensor = xp.broadcast_to(xp.asarray(sensor, np.int32), value.shape[:1])
+    seen = xp.where(mask, value, 0)
     return Measurement(
-        jnp.asarray(time, dtype), jnp.where(mask, value, 0).astype(dtype), sensor, mask
+        jnp.asarray(time, dtype), jnp.asarray(seen, dtype), jnp.asarray(sensor), jnp.asarray(mask)
     )
 
 
@@ -254,6 +255,7 @@ def _filtered(
     clock: Clock,
     key: Any,
 ) -> Trace:
+    measurements = cast(measurements, float_dtype(measurements.value))
     dtype = measurements.value.dtype
     state = initial(estimator, params, prior, t0, dtype, key)
     times = None if times is None else jnp.asarray(times, dtype)

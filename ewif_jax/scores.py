@@ -5,9 +5,10 @@ A score is a function (step, truth (k,), mask (m,)) -> () of one run after one a
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -112,6 +113,7 @@ def scored(
     )
 
 
+@partial(jax.jit, static_argnames="axis", inline=True)
 def average(values: Array, axis: int | None = None) -> Array:
     """Mean over `axis` of the values that are not NaN; NaN if there are none."""
     known = jnp.isfinite(values)

@@ -194,11 +194,7 @@ def compared(
     """Measured minus predicted (m, N), whether it and its square are numbers (N,) (else it is 0), R
     and its factor; absent components have difference 0 and unit variance."""
     time, value, sensor, mask = measurement
-
-    def see(sensor: Any, params: Any, x: Array, time: Array) -> tuple[Array, Array]:
-        return model.observe(params, x, sensor, time), model.measurement_cov(params, sensor, time)
-
-    check_sensor(model.sensors, see, sensor, params, particles[:, 0], time)
+    check_sensor(model, params, particles[:, 0], sensor, time)
     R = jnp.asarray(model.measurement_cov(params, sensor, time), particles.dtype)
     checks.shape("measurement.value", value, (R.shape[0],))
 

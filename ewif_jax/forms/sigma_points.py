@@ -60,11 +60,7 @@ def view(
     model: Model, params: Any, sensor: Array, t: Array, x: Array
 ) -> tuple[Callable[[Array], Array], Array]:
     """What the sensor sees as a function of a state (n,), and R (m, m); refuses a bad sensor."""
-
-    def seen(sensor: Any, params: Any, x: Array, t: Array) -> tuple[Array, Array]:
-        return model.observe(params, x, sensor, t), model.measurement_cov(params, sensor, t)
-
-    check_sensor(model.sensors, seen, sensor, params, x, t)
+    check_sensor(model, params, x, sensor, t)
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     return lambda x: jnp.asarray(model.observe(params, x, sensor, t), x.dtype), R
 

@@ -171,7 +171,7 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
         )
 
         def of(*at: Array) -> tuple[Array, ...]:
-            return tuple(_flat(fn)(*_merge(live, at, primals)))
+            return tuple(_inline(*_merge(live, at, primals), fn=fn, batch=0))
 
         return jax.jvp(of, tuple(at), tuple(moved))[1]
 
@@ -209,7 +209,7 @@ def _adjoint(
         fixed = tuple(not x for x in linear)
 
         def of(*xs: Array) -> tuple[Array, ...]:
-            return tuple(_flat(fn)(*_merge(fixed, known, _merge(linear, xs, linear))))
+            return tuple(_inline(*_merge(fixed, known, _merge(linear, xs, linear)), fn=fn, batch=0))
 
         given = tuple(
             jnp.broadcast_to(x, x.shape[:r] + runs)

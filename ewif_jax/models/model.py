@@ -154,11 +154,7 @@ def sight(
     model: Model, params: Any, x: Array, sensor: Array, t: Array
 ) -> tuple[Array, Array, Array]:
     """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
-
-    def seen(sensor: Any, params: Any, x: Array, t: Array) -> tuple[Array, Array]:
-        return model.observe(params, x, sensor, t), model.measurement_cov(params, sensor, t)
-
-    check_sensor(model.sensors, seen, sensor, params, x, t)
+    check_sensor(model, params, x, sensor, t)
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     if model.linear is not None:
         H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
@@ -184,11 +180,7 @@ def observation(
 ) -> tuple[Array, Array]:
     """H (m, n) and R (m, m) of a linear model."""
     linear = need_linear(model, "this operation")
-
-    def seen(sensor: Any, params: Any, t: Array) -> tuple[Array, Array]:
-        return linear.H(params, sensor, t), model.measurement_cov(params, sensor, t)
-
-    check_sensor(model.sensors, seen, sensor, params, t)
+    check_sensor(model, params, None, sensor, t)
     H = jnp.asarray(linear.H(params, sensor, t), dtype)
     return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
 

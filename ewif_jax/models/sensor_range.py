@@ -5,10 +5,10 @@ for another sensor. Where the index is known now it is checked: against the numb
 model knows it, else by evaluating what the model sees with JAX's index checks.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.experimental import checkify
@@ -16,29 +16,67 @@ from jax.extend.core import jaxpr_as_fun
 
 from ewif_jax import checks
 
+if TYPE_CHECKING:
+    from ewif_jax.models.model import Model
 
-def check_sensor(count: int | None, see: Callable[..., Any], sensor: Any, *inputs: Any) -> None:
-    """Refuses a known index outside 0..count-1, or one that `see(sensor, *inputs)` clamps."""
+
+def check_sensor(model: "Model", params: Any, x: Any, sensor: Any, t: Any) -> None:
+    """Refuses a known index that the model has no sensor for, or that it clamps where it looks
+    something up; a linear model does not need to know the state x."""
     index = checks.known(sensor)
     if index is None or index.ndim:
         return
-    checks.sensor("measurement.sensor", int(index), count)
-    if count is None and index > 0:
-        example = jax.tree.map(_example, inputs)
+    checks.sensor("measurement.sensor", int(index), model.sensors)
+    if model.sensors is None and index > 0:
         checks.require(
-            not _clamps(see, int(index), example) or _clamps(see, 0, example),
+            _inside(model, int(index), (params, None if model.linear else x, t)),
             "measurement.sensor",
             "an index inside the tables that H and R (or observe and measurement_cov) look up",
             int(index),
         )
 
 
-def _clamps(see: Callable[..., Any], index: int, inputs: tuple) -> bool:
-    """Whether an index goes out of range in see(index, *inputs), computed now even inside a trace.
+def _inside(model: "Model", index: int, inputs: tuple) -> bool:
+    """Whether the model has what it looks up for this index, asked once: the answer depends on the
+    sizes of tables, and on whole numbers that may be indices too."""
+    functions = model.linear, model.observe, model.measurement_cov
+    leaves, tree = jax.tree.flatten(inputs)
+    asked = (*map(id, functions), index, tree, *map(_size_or_index, leaves))
+    if asked not in _answers:
+        if len(_answers) >= 1000:
+            _answers.clear()
+        examples = jax.tree.map(_example, inputs)
+        inside = not _clamps(model, index, examples) or _clamps(model, 0, examples)
+        _answers[asked] = inside, functions
+    return _answers[asked][0]
+
+
+_answers: dict[Any, tuple[bool, Any]] = {}
+"""With the functions that were asked, which keeps others from getting their identities."""
+
+
+def _size_or_index(x: Any) -> Any:
+    aval = jax.typeof(x)
+    integer = jnp.issubdtype(aval.dtype, jnp.integer) or aval.dtype == bool
+    known = checks.known(x) if integer else None
+    return aval if known is None else (aval, known.tobytes())
+
+
+def _clamps(model: "Model", index: int, inputs: tuple) -> bool:
+    """Whether an index goes out of range in what the model sees, computed now even inside a trace.
 
     The checks are traced on their own first: they see nothing when traced in eager evaluation.
     """
-    checked = checkify.checkify(see, errors=checkify.index_checks)
+
+    linear = model.linear
+
+    def seen(sensor: Any, params: Any, x: Any, t: Any) -> tuple[Any, Any]:
+        R = model.measurement_cov(params, sensor, t)
+        if linear is None:
+            return model.observe(params, x, sensor, t), R
+        return linear.H(params, sensor, t), R
+
+    checked = checkify.checkify(seen, errors=checkify.index_checks)
     at = (np.int32(index), *inputs)
     jaxpr, shape = jax.make_jaxpr(lambda *args: checked(*args)[0], return_shape=True)(*at)
     with jax.ensure_compile_time_eval():

@@ -112,13 +112,13 @@ def _averages(
     runs = batch.truth.shape[0]
     count = next(iter(settings.values())).size // runs
 
-    def tiled(x: Array) -> Array:
-        return jnp.tile(x, (count,) + (1,) * (x.ndim - 1))
+    def tiled(x: Array) -> np.ndarray:
+        return np.tile(np.asarray(x), (count,) + (1,) * (x.ndim - 1))
 
     many = jax.tree.map(tiled, batch)
     scores = scored(
         estimator,
-        {name: jnp.asarray(v) for name, v in settings.items()},
+        settings,
         many.measurements,
         many.truth,
         scores=METRICS,

@@ -34,10 +34,10 @@ def arrivals(lag: int) -> np.ndarray:
 
 
 def responses(estimator: Estimator, n: int, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How the last estimate depends on the measured numbers (V, n, T), and its computed covariance
-    (V, n, n), for V streams of times (V, T) and a prior N(0, I) at 0."""
-    derivative, cov = _responses(estimator, n, jnp.asarray(times))
-    return np.asarray(derivative), np.asarray(cov)
+    """How the last estimate of a linear filter depends on the measured numbers (V, n, T), and its
+    computed covariance (V, n, n), for V streams of times (V, T) and a prior N(0, I) at 0."""
+    response, cov = _responses(estimator, n, times)
+    return np.asarray(response), np.asarray(cov)
 
 
 @partial(jax.jit, static_argnames=("estimator", "n"))
@@ -50,7 +50,9 @@ def _responses(estimator: Estimator, n: int, times: Array) -> tuple[Array, Array
         trace = run_filter(estimator, None, stream, prior=prior, t0=0.0)
         return trace.mean[-1], trace.cov[-1]
 
-    return jax.vmap(jax.jacrev(last, has_aux=True), (None, 0))(jnp.zeros(times.shape[1]), times)
+    # What a linear filter makes of a single 1 is a column of its response.
+    over_places = jax.vmap(last, (0, None), (1, None))
+    return jax.vmap(over_places, (None, 0))(jnp.eye(times.shape[1]), times)
 
 
 def sources(model: Model, n: int, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

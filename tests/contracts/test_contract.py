@@ -29,7 +29,8 @@ from ewif_jax import Estimator, Gaussian, Info, Measurement, Status, run, step
 
 each = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 AS_IT_IS = ("kalman", "ewif", "extended", "ensemble", "al1", "replay", "pf_extended")
-"""Whose hundreds of operations are also compiled one by one; the others' with --all."""
+"""Whose operations are also compiled one by one, and whose forward mode is compared with reverse
+mode; those of the others with --all."""
 some = pytest.mark.parametrize(
     "row",
     [pytest.param(row, marks=() if row.name in AS_IT_IS else pytest.mark.slow) for row in ROWS],
@@ -37,6 +38,7 @@ some = pytest.mark.parametrize(
 )
 both_dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
+FLOATS = {name: np.asarray(value) for name, value in PARAMS.items()}
 
 
 class Built(NamedTuple):
@@ -196,31 +198,39 @@ def test_vmap_is_the_loop(row):
         same(jax.tree.map(lambda x, k=k: x[k], batch), alone, **CLOSE)
 
 
-@each
-def test_gradient_is_finite_and_the_finite_difference(row):
+def loss_of(row: Row) -> Callable[[Any], jax.Array]:
     """With masked and late measurements, and from nothing where that is possible."""
     if not row.differentiable:
         pytest.skip("resampling is not differentiable")
+    built(row)  # its constants must not belong to a trace of the loss
 
     def loss(params: Any) -> jax.Array:
         trace = traced(row, params, known=not row.accepts_no_prior)
         errors = jnp.sum(trace.mean[2:] ** 2) + jnp.sum(trace.cov[2:, 0])
         return errors + 0.1 * jnp.sum(trace.info.log_likelihood)
 
-    def both_modes(params: Any) -> Any:
-        _, push = jax.linearize(loss, params)
-        (reverse,) = jax.linear_transpose(push, params)(jnp.ones(()))
-        return reverse, push(params)
+    return loss
 
-    built(row)  # its constants must not belong to the trace below
-    params = {name: jnp.asarray(value) for name, value in PARAMS.items()}
-    reverse, forward = jax.jit(both_modes)(params)
-    h = 1e-5
+
+@cache
+def gradient(row: Row) -> Any:
+    return jax.jit(jax.grad(loss_of(row)))(FLOATS)
+
+
+@each
+def test_gradient_is_finite_and_the_finite_difference(row):
+    loss, slope, h = loss_of(row), gradient(row), 1e-5
     for name, value in PARAMS.items():
         up, down = (loss({**PARAMS, name: value + shift}) for shift in (h, -h))
         expected = float(up - down) / (2 * h)
-        np.testing.assert_allclose(reverse[name], expected, rtol=1e-5, atol=1e-6, err_msg=name)
-    along = sum(reverse[name] * PARAMS[name] for name in PARAMS)
+        np.testing.assert_allclose(slope[name], expected, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@some
+def test_forward_mode_is_reverse_mode(row):
+    loss = loss_of(row)
+    forward = jax.jit(lambda params: jax.jvp(loss, (params,), (params,))[1])(FLOATS)
+    along = sum(gradient(row)[name] * PARAMS[name] for name in PARAMS)
     np.testing.assert_allclose(forward, along, rtol=1e-8, atol=1e-10)
 
 

@@ -108,9 +108,10 @@ def test_neither_groups_of_runs_nor_blocks_of_steps_show(steps, shared, groups):
             got,
             wanted,
         )
-    scores = {"score": scores_of.squared_innovation}  # without a truth, which is then of width 0
-    found = scored(estimator, params, measurements, scores=scores, **start)["score"]
-    np.testing.assert_allclose(found, np.sum(got.info.innovation**2, -1), rtol=1e-10)
+    if steps == 32:  # in blocks, each with its part of the truth, which is of width 0
+        scores = {"score": scores_of.squared_innovation}
+        found = scored(estimator, params, measurements, scores=scores, **start)["score"]
+        np.testing.assert_allclose(found, np.sum(got.info.innovation**2, -1), rtol=1e-10)
 
 
 def in_batch(estimator, params, measurements):
