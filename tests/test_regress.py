@@ -27,14 +27,14 @@ def test_weights_and_what_they_explain(n, m):
     wanted = cross @ np.linalg.inv(cov)
     np.testing.assert_allclose(weights, wanted, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(explained, wanted @ np.swapaxes(cross, 1, 2), rtol=1e-9, atol=1e-9)
-    alone = regress(cov[0], cross[0])
+    alone = jax.jit(regress)(cov[0], cross[0])
     np.testing.assert_allclose(alone[0], weights[0], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(alone[1], explained[0], rtol=1e-12, atol=1e-12)
 
 
 def test_one_covariance_may_be_shared():
     cov, cross = random_cov(4, 6)[0], RNG.normal(size=(7, 2, 4))
-    weights, explained = jax.vmap(regress, (None, 0))(cov, cross)
+    weights, explained = jax.jit(jax.vmap(regress, (None, 0)))(cov, cross)
     wanted = cross @ np.linalg.inv(cov)
     np.testing.assert_allclose(weights, wanted, rtol=1e-10)
     np.testing.assert_allclose(explained, wanted @ np.swapaxes(cross, 1, 2), rtol=1e-10)
@@ -45,7 +45,7 @@ def test_a_singular_covariance_explains_what_it_can(rank):
     """With the cross covariance in its range, weights times it is the cross covariance."""
     cov = random_cov(5, rank)
     cross = RNG.normal(size=(7, 2, 5)) @ cov
-    weights, explained = jax.vmap(regress)(cov, cross)
+    weights, explained = jax.jit(jax.vmap(regress))(cov, cross)
     np.testing.assert_allclose(weights @ cov, cross, atol=1e-9)
     wanted = cross @ np.linalg.pinv(cov, rcond=1e-10) @ np.swapaxes(cross, 1, 2)
     np.testing.assert_allclose(explained, wanted, atol=1e-9)

@@ -83,7 +83,7 @@ def test_gradient():
         return loss(run_parallel(model(), params, world.stream(), tau=tau, **arguments))
 
     slope = (sequential(0.9 + 1e-5) - sequential(0.9 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(jax.grad(parallel)(0.9), slope, rtol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.grad(parallel))(0.9), slope, rtol=1e-7)
 
 
 def test_float32_is_close_far_from_zero():

@@ -50,7 +50,7 @@ def test_derivative_equals_that_of_batch_wls():
         params = {**world.params, "tau": decay}
         return batch_wls(model(), params, data, REPORTS, weight=both_sides).mean
 
-    close(jax.jacrev(passes)(0.9), jax.jacfwd(dense)(0.9), rtol=1e-8)
+    close(jax.jit(jax.jacrev(passes))(0.9), jax.jit(jax.jacfwd(dense))(0.9), rtol=1e-8)
 
 
 def test_padding_changes_nothing():

@@ -182,8 +182,9 @@ def test_steady_state_derivatives():
         steady = steady_state_continuous(driven, fading_rate=rate)
         return jnp.trace(steady.error) + jnp.sum(steady.gain)
 
-    for fn, at in ((loss, (1.1, 0.9)), (loss_continuous, (0.2, 0.9))):
-        slopes = jax.grad(fn, argnums=(0, 1))(*at)
+    for of, at in ((loss, (1.1, 0.9)), (loss_continuous, (0.2, 0.9))):
+        fn = jax.jit(of)
+        slopes = jax.jit(jax.grad(of, argnums=(0, 1)))(*at)
         for k in range(2):
             up, down = (tuple(x + s * (i == k) for i, x in enumerate(at)) for s in (1e-5, -1e-5))
             np.testing.assert_allclose(slopes[k], (fn(*up) - fn(*down)) / 2e-5, rtol=1e-6)

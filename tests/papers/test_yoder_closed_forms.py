@@ -184,7 +184,7 @@ def test_a_growing_mode_without_noise_is_followed(name):
     steps = np.linspace(0, 60, 60_001)
     last = steps[np.flatnonzero(norm_ratios((F, H, Q, R), steps) >= 0.6)[-1]]
     assert 0 <= cutoff_delay(F, H, Q, R) - last < 1.001e-3
-    slope, h = jax.grad(lambda r: cutoff_delay(F, H, Q, r * R))(1.3), 1e-4
+    slope, h = jax.jit(jax.grad(lambda r: cutoff_delay(F, H, Q, r * R)))(1.3), 1e-4
     ends = [cutoff_delay(F, H, Q, (1.3 + s) * R) for s in (h, -h)]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-8)
 
