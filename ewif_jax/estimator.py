@@ -133,8 +133,7 @@ def validated(
     last = None if sensors is None else np.int32(sensors.max())
 
     def first() -> Any:
-        # A NumPy table among the parameters could not be indexed while tracing.
-        given = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, params)
+        given = jax.tree.map(_indexable, params)
         state = initial(estimator, given, prior, t0, dtype, key)
         if not last and not jax.tree.leaves(params):
             return state  # nothing is known that the program itself would not refuse
@@ -152,6 +151,12 @@ def validated(
             _tried.clear()
         _tried[trial] = jax.eval_shape(first)
     return _tried[trial]
+
+
+def _indexable(x: Any) -> Any:
+    """`x`, its value known as before; but a NumPy table cannot be indexed while tracing."""
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(x) if isinstance(x, np.ndarray) else x
 
 
 _tried: dict[Any, Any] = {}
@@ -243,6 +248,11 @@ def verdict(
 def choose(condition: Array, yes: Any, no: Any) -> Any:
     """`yes` where the scalar `condition` holds, else `no`, for whole pytrees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def copies(tree: Any, count: int) -> Any:
+    """`tree` so many times over, along a new leading axis of every leaf."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
 
 def _filtered(

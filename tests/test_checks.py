@@ -231,6 +231,10 @@ REFUSED = {
         lambda: run(ej.ewif(WORLD, lambda p: p), params=-1.0),
         "tau: expected a positive number, got -1.0",
     ),
+    "a negative tau among the parameters, as an array": (
+        lambda: run(ej.ewif(WORLD, lambda p: p["tau"]), params={"tau": np.array(-1.0)}),
+        "tau: expected a positive number, got -1.0",
+    ),
     "NaN tau": (lambda: ej.ewif(WORLD, np.nan), "tau: expected a positive number, got nan"),
     "tau in words": (lambda: ej.ewif(WORLD, "1"), "tau: expected a positive number, got '1'"),
     "neither tau nor weight": (lambda: ej.ewif(WORLD), "tau: expected one of `tau` and `weight`"),
@@ -577,6 +581,29 @@ def test_indices_are_checked_inside_a_gradient_too():
 
     with pytest.raises(ValueError, match=r"measurement.sensor: expected an index inside"):
         jax.grad(loss)(jnp.ones((2, 1, 2)))
+
+
+def test_tables_are_looked_into_once_for_their_size_and_the_indices_they_hold():
+    """Not for every new value, which would compile a program; `run` tries one arrival for each."""
+    asked = []
+
+    def H(p, sensor, t):
+        asked.append(sensor)
+        return p["H"][p["row"][sensor]]
+
+    estimator = ej.kalman(ej.linear_model(SQUARE, H, np.eye(1)))
+
+    def looks(rows, *where):
+        asked.clear()
+        params = {"H": np.random.default_rng().normal(size=(rows, 1, 2)), "row": np.array(where)}
+        run(estimator, stream=swap(sensor=np.array([0, 1, 1])), params=params)
+        return len(asked)
+
+    assert looks(2, 0, 1) > 1
+    assert looks(2, 0, 1) == 1
+    for rows, *where in ((1, 0, 1), (2, 0, 5)):
+        with pytest.raises(ValueError, match=r"measurement.sensor: expected an index inside"):
+            looks(rows, *where)
 
 
 def test_a_function_that_branches_on_the_sensor_is_not_a_table():

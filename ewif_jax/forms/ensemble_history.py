@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import choose, copies, verdict
 from ewif_jax.forms import ensembles
 from ewif_jax.models import Model
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -60,8 +60,8 @@ def delayed(
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> EnsembleHistory:
         del params
         now = ensembles.start(prior, t0, key, count, method)
-        stored = jnp.stack([now.members] * lag)
-        past = Slots(jnp.stack([now.time] * lag), stored, stored if forecasts else None)
+        times, stored = copies((now.time, now.members), lag)
+        past = Slots(times, stored, stored if forecasts else None)
         return EnsembleHistory(now.time, now, jnp.asarray(False), past)
 
     def predict(params: Any, state: EnsembleHistory, time: Array) -> EnsembleHistory:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import choose, copies, verdict
 from ewif_jax.forms.innovations import Compared, sound
 from ewif_jax.kernels import cholesky, gaussian, slots, symmetric, window
 from ewif_jax.kernels.small import matmul, matvec
@@ -88,7 +88,7 @@ def asd(model: Model, lag: int) -> Estimator:
         one = jnp.eye(noise.shape[0], dtype=mean.dtype)
         none = jnp.zeros((noise.shape[0], mean.shape[0]), mean.dtype)
         first = window.Kept(time, mean, cov, still, none, one, none.T, one, none[:, 0])
-        kept = jax.tree.map(lambda leaf: jnp.stack([leaf] * count), first)
+        kept = copies(first, count)
         return WindowState(time, mean, cov, still, kept)
 
     def predict(params: Any, state: WindowState, time: Array) -> WindowState:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
+from ewif_jax.estimator import choose, copies, verdict
 from ewif_jax.forms.covariance import CovarianceState, covariance_form
 from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import cholesky, slots, symmetric
@@ -54,7 +54,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> HistoryState:
         first = form.init(params, prior, t0, key)
-        past = jax.tree.map(lambda leaf: jnp.stack([leaf] * lag), first)
+        past = copies(first, lag)
         return HistoryState(first.time, first.mean, first.cov, jnp.asarray(False), past)
 
     def predict(params: Any, state: HistoryState, time: Array) -> HistoryState:

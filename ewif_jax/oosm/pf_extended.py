@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.estimator import copies
 from ewif_jax.forms import particles as form
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
@@ -80,8 +81,8 @@ def pf_extended(
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> PathState:
         del params
         first = form.draw(kind, "pf_extended", prior, t0, key)
-        past = jnp.stack([first.particles] * lag)
-        return PathState(*first, jnp.asarray(False), jnp.stack([first.time] * lag), past)
+        times, past = copies((first.time, first.particles), lag)
+        return PathState(*first, jnp.asarray(False), times, past)
 
     def predict(params: Any, state: PathState, time: Array) -> PathState:
         time = jnp.asarray(time, state.time.dtype)

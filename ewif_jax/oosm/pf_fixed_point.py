@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.estimator import copies
 from ewif_jax.forms import particles as form
 from ewif_jax.forms.covariance import CovarianceState
 from ewif_jax.forms.fixed_point import Conditional, fixed_point, given
@@ -117,7 +118,7 @@ def pf_fixed_point(
         nothing = Measurement(
             first.time, jnp.zeros(m, dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
         )
-        past, measured = jax.tree.map(lambda x: jnp.stack([x] * slots), (known, nothing))
+        past, measured = copies((known, nothing), slots)
         return SummaryState(*first, past, measured)
 
     def update(
