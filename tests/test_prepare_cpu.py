@@ -27,22 +27,20 @@ if sys.argv[2] == "prepared":
     ej.prepare_cpu(devices=2)  # asking twice is no mistake
 jax.config.update("jax_enable_x64", True)
 
-model = ej.models.constant_acceleration(sensors=ej.models.position_sensor(0.3), q=0.2)
+model = ej.models.constant_acceleration(sensors=ej.models.position_sensor(0.3), q=lambda p: p["q"])
 time = jnp.asarray([0.1, 0.2, 0.45, 0.3, 0.7, 0.71, 0.9])  # one is late
 values = jnp.sin(time + jnp.arange(4.0)[:, None])
 prior = ej.Gaussian(jnp.zeros(3), jnp.eye(3))
 filters = {"ewif": ej.ewif(model, lambda p: p["tau"]), "al1": ej.al1(model, 3)}
-found = {}
+params, stream, found = {"tau": 1.0, "q": 0.2}, ej.stream(time, values[0]), {}
 batch = jax.vmap(lambda v: ej.stream(time, v))(values)
+def squares(params):
+    return jnp.sum(ej.run(filters["al1"], params, stream, prior=prior, t0=0.0).mean ** 2)
 for name, estimator in filters.items():
-    def filtered(params, value):
-        return ej.run(estimator, params, ej.stream(time, value), prior=prior, t0=0.0)
-    def loss(params):
-        return jnp.sum(filtered(params, values[0]).mean ** 2)
-    trace = filtered({"tau": 1.0}, values[0])
-    batched = ej.run_batch(estimator, {"tau": 1.0}, batch, prior=prior, t0=0.0)
+    trace = ej.run(estimator, params, stream, prior=prior, t0=0.0)
+    batched = ej.run_batch(estimator, params, batch, prior=prior, t0=0.0)
     found |= {f"{name} mean": trace.mean, f"{name} cov": trace.cov, f"{name} batch": batched.mean}
-    found[f"{name} slope"] = jax.jit(jax.grad(loss))({"tau": 1.0})["tau"]
+found["slope"] = jax.jit(jax.grad(squares))(params)["q"]
 error = ej.rmse_loss(filters["ewif"], batch, values[..., None], prior=prior, t0=0.0)
 program = jax.jit(jax.value_and_grad(error)).lower({"tau": jnp.asarray(1.0)}).compile()
 found["loss and gradient"] = jnp.stack([x["tau"] if isinstance(x, dict) else x

@@ -3,7 +3,7 @@
 Compiling is what takes the time, so each function of an estimator is compiled once and shared.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -29,13 +29,20 @@ from ewif_jax import Estimator, Gaussian, Info, Measurement, Status, run, step
 
 each = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 AS_IT_IS = ("kalman", "ewif", "extended", "ensemble", "al1", "replay", "pf_extended")
-"""Whose operations are also compiled one by one, and whose forward mode is compared with reverse
-mode; those of the others with --all."""
-some = pytest.mark.parametrize(
-    "row",
-    [pytest.param(row, marks=() if row.name in AS_IT_IS else pytest.mark.slow) for row in ROWS],
-    ids=lambda row: row.name,
-)
+"""Whose hundreds of operations are also compiled one by one; the others' with --all."""
+BOTH_MODES = ("kalman", "ewif", "replay")
+"""Whose forward mode is compared with reverse mode; the others' with --all."""
+NONLINEAR = ("extended", "unscented", "ensemble", "ensemble_square_root", "enkf1", "enkf2_shared",
+             "rts_reference", "al1", "asd")  # fmt: skip
+"""Whose gradients test_ensemble_filters_survive_and_differentiate compares; here with --all."""
+
+
+def some(names: Collection[str]) -> Any:
+    """These rows; the others with --all."""
+    rows = [pytest.param(row, marks=() if row.name in names else pytest.mark.slow) for row in ROWS]
+    return pytest.mark.parametrize("row", rows, ids=lambda row: row.name)
+
+
 both_dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
 FLOATS = {name: np.asarray(value) for name, value in PARAMS.items()}
@@ -165,7 +172,7 @@ def test_float32_is_close_to_float64(row):
         np.testing.assert_allclose(single.infos[k].log_likelihood, expected, rtol=1e-4, atol=1e-4)
 
 
-@some
+@some(AS_IT_IS)
 def test_jit_is_eager(row):
     state, z = streamed(row).states[6], arrival(6)
     eager = step(built(row).estimator, PARAMS, state, z)
@@ -217,7 +224,7 @@ def gradient(row: Row) -> Any:
     return jax.jit(jax.grad(loss_of(row)))(FLOATS)
 
 
-@each
+@some({row.name for row in ROWS}.difference(NONLINEAR))
 def test_gradient_is_finite_and_the_finite_difference(row):
     loss, slope, h = loss_of(row), gradient(row), 1e-5
     for name, value in PARAMS.items():
@@ -226,7 +233,7 @@ def test_gradient_is_finite_and_the_finite_difference(row):
         np.testing.assert_allclose(slope[name], expected, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-@some
+@some(BOTH_MODES)
 def test_forward_mode_is_reverse_mode(row):
     loss = loss_of(row)
     forward = jax.jit(lambda params: jax.jvp(loss, (params,), (params,))[1])(FLOATS)

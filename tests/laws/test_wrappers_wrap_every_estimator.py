@@ -26,7 +26,7 @@ ESTIMATORS = {
     "pf_fixed_point": lambda: ej.pf_fixed_point(GIVEN.model, SIZE, LAG),
 }
 
-EVERY_KIND = ("ensemble", "rts_reference", "pf_fixed_point")
+EVERY_KIND = ("ensemble", "rts_reference", "enkf2")
 """one of every kind: random, with a history, with both"""
 
 

@@ -1,6 +1,7 @@
 """The experiments of Yoder et al., section 4, at reduced size: each claim as we measure it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from apart import apart
@@ -29,16 +30,14 @@ HEAD = {0: 55.28, 2: 53.40, 3: 52.41, 4: 51.82, heads.stale(): 51.34, 8: 51.33, 
 def walked():
     """Mean squared errors (V, 3, R) at the multiples of T_d, and of the exact estimate (3, R)."""
     runs, cases = 16, CASES
-    batches = [
-        ej.simulate_batch(
-            random_walk(case.sigma**2, walks.VARIANCE, walks.INTERVAL, case.delay),
-            jax.random.split(jax.random.key(i), runs),
-        )
-        for i, case in enumerate(cases)
-    ]
-    batch = jax.tree.map(lambda *x: np.concatenate(x), *batches)
     limits = np.repeat([walks.theoretical(case.sigma) for case in cases], runs)
-    q = np.repeat([case.sigma**2 for case in cases], runs)
+    q, delay = (np.repeat(x, runs) for x in ([c.sigma**2 for c in cases], [c.delay for c in cases]))
+    keys = jnp.concatenate([jax.random.split(jax.random.key(i), runs) for i in range(len(cases))])
+
+    def one(q, delay, key):
+        return random_walk(q, walks.VARIANCE, walks.INTERVAL, delay).simulate(key)
+
+    batch = jax.device_get(jax.jit(jax.vmap(one))(q, delay, keys))
     found = sweep(
         walks.selective_al1(history_needed(batch.measurements)),
         {"cutoff": walks.MULTIPLES[:, None] * limits, "q": np.tile(q, (walks.MULTIPLES.size, 1))},
@@ -47,10 +46,11 @@ def walked():
         t0=0.0,
     )
     exact = []
-    for case, one in zip(cases, batches, strict=True):
+    for i, case in enumerate(cases):
+        own = jax.tree.map(lambda x, i=i: x[i * runs : (i + 1) * runs], batch)
         window = round((20 * walks.theoretical(case.sigma) + 10 * case.delay) / walks.INTERVAL)
         model = random_walk_model(case.sigma**2, walks.VARIANCE)
-        exact.append(exact_late(model, random_walk(), one, window, effort=1_000_000))
+        exact.append(exact_late(model, random_walk(), own, window, effort=1_000_000))
     assert found["too_late"][-1].max() == 0
     return found["squared_error"].reshape(-1, len(cases), runs), np.stack(exact)
 
