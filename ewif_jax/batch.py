@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
@@ -20,8 +21,8 @@ from ewif_jax.layout import (
     Frozen,
     broadcast_prefix,
     device_count,
-    first_run,
     on_devices,
+    one_run,
     over_devices,
 )
 from ewif_jax.loops import Loop, over_runs
@@ -81,9 +82,8 @@ def run_batch(
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
     """
     checks.stream(measurements, batched=True)
-    value = jnp.asarray(measurements.value)
-    checks.shape("measurements.value", value, ("R", "T", "m"))
-    runs = value.shape[0]
+    checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
+    runs = np.shape(measurements.value)[0]
     inputs, input_flags = flagged(params, params_per_run, measurements, prior, times)
     check_runs(estimator, inputs, input_flags, t0, clock, key)
     flags = (
@@ -126,12 +126,26 @@ def _ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
 def check_runs(
     estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, key: Any
 ) -> None:
-    """Refuses what `run` refuses, with the first run for all and the largest sensor of any run."""
-    first = first_run(inputs, flags)
+    """Refuses what `run` refuses, with the first run for all, the largest sensor of any run, and
+    the parameters also of the runs in which one of them is lowest."""
+    params, params_f = inputs[0], flags[0]
+    _, measurements, prior, times = one_run(inputs, flags)
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
-        first = (first[0], first[1]._replace(sensor=sensors.max(0)), *first[2:])
-    validated(estimator, first[0], first[1], first[2], t0, first[3], clock, key)
+        measurements = measurements._replace(sensor=sensors.max(0))
+    for k in {0, *_lowest(params, params_f)}:
+        own = one_run(params, params_f, k)
+        validated(estimator, own, measurements, prior, t0, times, clock, key)
+
+
+def _lowest(params: Any, flags: Any) -> set[int]:
+    """Where the numbers that each run has of its own are lowest, or not numbers."""
+    numbers = [
+        checks.known(x)
+        for x, f in zip(*map(jax.tree.leaves, (params, flags)), strict=True)
+        if f and jnp.ndim(x) == 1 and jnp.issubdtype(jnp.result_type(x), jnp.number)
+    ]
+    return {int(np.argmin(x)) for x in numbers if x is not None}
 
 
 @partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices", "complete"))

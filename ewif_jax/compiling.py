@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.errors import JaxRuntimeError
 
@@ -96,6 +97,14 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
         return (plain if inner or not _known() else quick)(*args, **kwargs)
 
     return call
+
+
+def array(x: Any, dtype: Any = None) -> jax.Array:
+    """`x` as an array of JAX. Of an array of NumPy `jnp.asarray` makes it with a program, compiled
+    for every shape; this makes it with none."""
+    if isinstance(x, np.ndarray):
+        return jnp.array(x if dtype is None else x.astype(dtype))
+    return jnp.asarray(x, dtype)
 
 
 def transformed(inputs: Any) -> bool:

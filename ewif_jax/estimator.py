@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.compiling import QUICK, QUICKEST, quick_jit
+from ewif_jax.compiling import QUICK, QUICKEST, array, quick_jit
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 Clock = Literal["validity", "arrival"]
@@ -156,7 +156,7 @@ def validated(
 def _indexable(x: Any) -> Any:
     """`x`, its value known as before; but a NumPy table cannot be indexed while tracing."""
     with jax.ensure_compile_time_eval():
-        return jnp.asarray(x) if isinstance(x, np.ndarray) else x
+        return array(x) if isinstance(x, np.ndarray) else x
 
 
 _tried: dict[Any, Any] = {}
@@ -220,7 +220,7 @@ def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurem
     sensor = xp.broadcast_to(xp.asarray(sensor, np.int32), value.shape[:1])
     seen = xp.where(mask, value, 0)
     return Measurement(
-        jnp.asarray(time, dtype), jnp.asarray(seen, dtype), jnp.asarray(sensor), jnp.asarray(mask)
+        array(xp.asarray(time), dtype), array(seen, dtype), array(sensor), array(mask)
     )
 
 

@@ -39,14 +39,14 @@ def joined(flagged: Sequence[Any], others: Sequence[Any], flags: Any) -> Any:
     return jax.tree.map(lambda f: next(marked) if f else next(rest), flags)
 
 
-def first_run(tree: Any, flags: Any) -> Any:
-    """The first along the leading axis of the flagged leaves; NumPy stays NumPy, known known."""
+def one_run(tree: Any, flags: Any, k: int = 0) -> Any:
+    """Number k along the leading axis of the flagged leaves; NumPy stays NumPy, known known."""
 
-    def first(x: Any, flag: bool) -> Any:
+    def one(x: Any, flag: bool) -> Any:
         known = checks.known(x) if flag and not _is_key(x) else None
-        return x if not flag else x[0] if known is None else known[0]
+        return x if not flag else x[k] if known is None else known[k]
 
-    return jax.tree.map(first, tree, flags)
+    return jax.tree.map(one, tree, flags)
 
 
 def runs_last(tree: Any, flags: Any) -> Any:
@@ -157,4 +157,4 @@ class Frozen:
 
 
 def _is_key(x: Any) -> bool:
-    return jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key)
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

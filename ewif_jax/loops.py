@@ -11,8 +11,8 @@ from jax import Array, lax
 from ewif_jax.dependence import Divided, Traced, dependence, divided, traced
 from ewif_jax.groups import Place, group_size, in_groups, scan_in_blocks
 from ewif_jax.layout import (
-    first_run,
     joined,
+    one_run,
     parted,
     runs_adjacent,
     runs_first,
@@ -42,7 +42,7 @@ def over_runs(
         flags: which of their leaves have a leading axis of runs.
     """
     params, measurements, prior, times, key, context = jax.eval_shape(
-        lambda inputs: first_run(inputs, flags), inputs
+        lambda inputs: one_run(inputs, flags), inputs
     )
     params_f, measurements_f, prior_f, times_f, key_f, context_f = flags
     start = traced(loop.start, params, prior, key)
@@ -109,7 +109,7 @@ def _shared_ahead(
         outputs, needed = parts.ahead([*parted(params, params_f)[1], *state, *arrival])
         return outputs[: len(state)], (outputs[len(state) :], needed)
 
-    first = first_run((params, prior, keys), (params_f, prior_f, keys_f))
+    first = one_run((params, prior, keys), (params_f, prior_f, keys_f))
     state = parted(loop.start(*first), state_f)[1]
     arrivals = parted((measurements, times, context), arrival_f)[1]
     last, (seen, needed) = lax.scan(step_ahead, state, arrivals, steps)
@@ -140,7 +140,7 @@ def _in_groups(
     def together(inputs: Any, place: Place | None) -> tuple[Any, Any]:
         if size > 1:
             return _scanned(loop, runs_last(inputs, flags), flags, differ, size, place)
-        inputs, (alike, same) = first_run(inputs, flags), _alike((flags, differ))
+        inputs, (alike, same) = one_run(inputs, flags), _alike((flags, differ))
         return _scanned(loop, inputs, alike, same, size, place)
 
     return in_groups(together, inputs, flags, inputs[1].value.shape[0], size)

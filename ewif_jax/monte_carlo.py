@@ -110,16 +110,15 @@ def monte_carlo(
             checks.require(
                 jnp.shape(leaf)[:1] == (runs,), "params", f"{runs} runs", jnp.shape(leaf)
             )
-    run_keys = jax.vmap(lambda i: jax.random.fold_in(key, i))
     per_run: list[dict[str, np.ndarray]] = []
     missing: list[dict[str, np.ndarray]] = []
     moments: Any = None
     for begin in range(0, runs, chunk):
         count = min(chunk, runs - begin)
         # Filled up with repetitions, so that the last chunk is not compiled again.
-        index = jnp.minimum(jnp.arange(begin, begin + chunk), runs - 1)
+        index = np.minimum(np.arange(begin, begin + chunk), runs - 1)
         some = jax.tree.map(lambda x, f, i=index: x[i] if f else x, params, marked)
-        keys = run_keys(index)
+        keys, own_keys = _keys(key, index)
         simulation = simulate_batch(scenario, keys)
         values = scored(
             estimator,
@@ -131,7 +130,7 @@ def monte_carlo(
             t0=scenario.t0,
             times=simulation.times,
             clock=scenario.clock,
-            key=jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys),
+            key=own_keys,
             params_per_run=params_per_run,
             devices=devices,
         )
@@ -149,6 +148,13 @@ def monte_carlo(
             variance = np.maximum(square / count - mean**2, 0) * count / np.maximum(count - 1, 1)
             per_step[name], per_step_se[name] = mean, np.sqrt(variance / count)
     return Statistics(_join(per_run), per_step, per_step_se, _join(missing))
+
+
+@jax.jit
+def _keys(key: Array, index: Array) -> tuple[Array, Array]:
+    """For each run one key to simulate it and one to filter it."""
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(index)
+    return keys, jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys)
 
 
 def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:

@@ -10,11 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.consistency import nees, nis
 from ewif_jax.batch import Observer, Step, run_batch
+from ewif_jax.compiling import array
 from ewif_jax.estimator import Clock, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement, Status
 
@@ -85,17 +87,16 @@ def scored(
     Arguments as in `run_batch`; a single stream is a batch of one. `truth` is (T, k) or
     (R, T, k), or None for scores that need none; `key` may be one typed key for each run.
     """
-    value = jnp.asarray(measurements.value)
-    if value.ndim == 2:
-        measurements = measurements._replace(value=value[None])
+    if np.ndim(measurements.value) == 2:
+        measurements = measurements._replace(value=array(measurements.value)[None])
     checks.stream(measurements, batched=True)
-    runs, steps = jnp.shape(measurements.value)[:2]
-    truth = jnp.zeros((steps, 0)) if truth is None else jnp.asarray(truth)
+    runs, steps = np.shape(measurements.value)[:2]
+    truth = array(np.zeros((steps, 0)) if truth is None else truth)
     lead = ("R", "T") if truth.ndim == 3 else ("T",)
     checks.shape("truth", truth, (*lead, "k"))
     same = truth.shape[-2] == steps and (truth.ndim == 2 or truth.shape[0] == runs)
     checks.require(same, "truth", f"{runs} runs and {steps} arrivals", f"shape {truth.shape}")
-    mask = jnp.asarray(measurements.mask, bool)
+    mask = array(measurements.mask)
     return run_batch(
         estimator,
         params,

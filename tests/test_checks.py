@@ -235,6 +235,17 @@ REFUSED = {
         lambda: run(ej.ewif(WORLD, lambda p: p["tau"]), params={"tau": np.array(-1.0)}),
         "tau: expected a positive number, got -1.0",
     ),
+    "a negative tau of one run among many": (
+        lambda: ej.run_batch(
+            ej.ewif(WORLD, lambda p: p["tau"]),
+            {"tau": np.array([1.0, -2.0])},
+            swap(value=np.ones((2, 3, 1))),
+            prior=PRIOR,
+            t0=0.0,
+            params_per_run=True,
+        ),
+        "tau: expected a positive number, got -2.0",
+    ),
     "NaN tau": (lambda: ej.ewif(WORLD, np.nan), "tau: expected a positive number, got nan"),
     "tau in words": (lambda: ej.ewif(WORLD, "1"), "tau: expected a positive number, got '1'"),
     "neither tau nor weight": (lambda: ej.ewif(WORLD), "tau: expected one of `tau` and `weight`"),

@@ -9,6 +9,7 @@ from jax import Array
 from jax.scipy.special import gammainc
 
 from ewif_jax import checks
+from ewif_jax.compiling import array
 from ewif_jax.kernels import cholesky
 from ewif_jax.types import Info
 
@@ -45,7 +46,7 @@ def nees(mean: Array, cov: Array, truth: Array) -> Array:
 
     Chi-square with k degrees of freedom (mean k) if the filter is consistent.
     """
-    return _normalised(jnp.asarray(mean), jnp.asarray(cov), jnp.asarray(truth))
+    return _normalised(array(mean), array(cov), array(truth))
 
 
 def nis(info: Info) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.compiling import array
 from ewif_jax.kernels.small import matvec
 from ewif_jax.kernels.sparse import Pattern, pattern
 from ewif_jax.models.sensor_range import check_sensor
@@ -230,7 +231,7 @@ def _one_step(F: Any) -> tuple[Any, int | None]:
     checks.shape("F", F, ("n", "n"))
     checks.require(np.shape(F)[0] == np.shape(F)[1], "F", "a square matrix", np.shape(F))
     checks.finite("F", F)
-    ahead = jnp.asarray(F)
+    ahead = array(F)
     n = ahead.shape[0]
     known = np.asarray(F)
     invertible = np.linalg.matrix_rank(known) == n
@@ -267,7 +268,7 @@ def _by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
     matrix that all sensors share, None for a function."""
     if callable(x):
         return x, None
-    table = jnp.asarray(x)
+    table = array(x)
     checks.finite(argument, x)
     checks.require(
         table.ndim in (2, 3), argument, "a function, a matrix or a table (S, ., .)", table.shape

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.compiling import array
 from ewif_jax.kernels.sparse import Pattern, pattern
 from ewif_jax.models.model import resolve, select
 
@@ -117,7 +118,7 @@ def bank(
 
     def matrix(n: int) -> tuple[Callable[..., Array], Pattern]:
         known = [m(n) for m in matrices if m is not None]
-        table = [jnp.asarray(m) for m in known]
+        table = [array(m) for m in known]
         return (lambda params, sensor, t: choose(table, sensor)), pattern(*known)
 
     return observe, cov, residual, matrix, len(group)

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax.batch import Step
+from ewif_jax.compiling import array
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Scenario, Simulation
@@ -154,7 +155,7 @@ def exact_late(
 
     def windows(x: Any) -> Array:
         chosen = np.asarray(x)[rows, source]
-        return jnp.asarray(chosen.reshape(-1, window, *chosen.shape[3:]))
+        return array(chosen.reshape(-1, window, *chosen.shape[3:]))
 
     times, values = batch.measurements[:2]
     stream = Measurement(

@@ -4,12 +4,12 @@ import hashlib
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pandas as pd
 import xarray as xr
 
+from ewif_jax.compiling import array
 from ewif_jax.study import track_figures
 from ewif_jax.study.experiment import Experiment, Options, Refused
 from ewif_jax.study.readings import Readings, read
@@ -80,7 +80,7 @@ def _outcome(
     measurements: Measurement,
     counted: np.ndarray,
 ) -> Outcome:
-    measurements = jax.tree.map(jnp.asarray, measurements)
+    measurements = jax.tree.map(array, measurements)
     with experiment.timed("filtering"):
         before = after = filtered(chosen, chosen.params, measurements)
     start = chosen.params[chosen.name]
