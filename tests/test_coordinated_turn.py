@@ -1,5 +1,7 @@
 """The coordinated turn is the motion it says, in both directions and next to turn rate zero."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +31,11 @@ def move(x, t0, t1):
 @jax.jit
 def jacobian(x, t0, t1):
     return jax.jacfwd(lambda x: TURN.transition(None, x, t0, t1))(x)
+
+
+@jax.jit
+def flowing(q_turn, x, t0, t1):
+    return flow(TURN, q_turn, x, t0, t1)
 
 
 def integrated(x, t0, t1):
@@ -85,8 +92,8 @@ def test_derivatives_at_rate_zero_are_the_analytic_limits():
 def test_turning_at_rate_zero_is_constant_velocity():
     x, t0, t1 = start(0.0), jnp.asarray(0.4), jnp.asarray(2.1)
     straight = constant_velocity(sensors=SEEN, q=2.0, dims=2)
-    moved, F, Q = flow(TURN, 0.3, x, t0, t1)
-    there, F_there, Q_there = flow(straight, None, x[:4], t0, t1)
+    moved, F, Q = flowing(0.3, x, t0, t1)
+    there, F_there, Q_there = jax.jit(partial(flow, straight, None))(x[:4], t0, t1)
     close(moved[:4], there)
     close(F[:4, :4], F_there)
     close(Q[:4, :4], Q_there)
@@ -107,8 +114,8 @@ def test_noise_of_an_interval_is_that_of_its_parts():
 @pytest.mark.parametrize("rate", [0.0, 1e-6, 1e-3, -0.11, 0.6])
 def test_float32_keeps_its_digits(rate):
     x, t0, t1 = start(rate, np.float32), jnp.float32(0.0), jnp.float32(3.0)
-    moved, F, Q = flow(TURN, jnp.float32(0.3), x, t0, t1)
-    exact, F_exact, Q_exact = flow(TURN, 0.3, x.astype(float), t0.astype(float), t1.astype(float))
+    moved, F, Q = flowing(np.float32(0.3), x, t0, t1)
+    exact, F_exact, Q_exact = flowing(0.3, x.astype(float), float(t0), float(t1))
     assert moved.dtype == F.dtype == Q.dtype == np.float32
     np.testing.assert_allclose(moved, exact, rtol=1e-6)
     np.testing.assert_allclose(F, F_exact, rtol=1e-5, atol=1e-6 * np.abs(F_exact).max())

@@ -107,7 +107,7 @@ def test_the_third_sensor_alone_updates_the_extended_filter():
 
 def test_float32():
     with jax.enable_x64(False):
-        one = turn().simulate(jax.random.key(0))
+        one = jax.jit(turn().simulate)(jax.random.key(0))
         assert {x.dtype.name for x in jax.tree.leaves(one)} == {"float32", "int32", "bool"}
         assert turn_state(1.5).dtype == np.float32
 

@@ -106,7 +106,7 @@ def test_bearings_have_the_noise_they_should():
 
 def test_float32():
     with jax.enable_x64(False):
-        one = two_bearings(10.0).simulate(jax.random.key(0))
+        one = jax.jit(two_bearings(10.0).simulate)(jax.random.key(0))
         assert {x.dtype.name for x in jax.tree.leaves(one)} == {"float32", "int32", "bool"}
         assert np.isfinite(one.measurements.value).all()
 

@@ -60,7 +60,7 @@ def test_padding_the_shorter_delays_changes_nothing():
     method = runs_of.methods(10)[runs_of.EKF]
     found = runs_of.followed(method, world, jax.random.key(0))
     scenario = two_bearings(10.0)
-    one = scenario.simulate(jax.random.split(key, 2)[1])
+    one = jax.jit(scenario.simulate)(jax.random.split(key, 2)[1])
     trace = ej.run(
         method.estimator, None, one.measurements, prior=scenario.prior, t0=0.0, times=one.times,
         clock="arrival",
