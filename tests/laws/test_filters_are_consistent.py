@@ -118,7 +118,12 @@ def test_errors_and_innovations(name):
     agree(name, ej.nis(trace.info), 1)
 
 
-@pytest.mark.parametrize("name", [*IN_SEQUENCE, *LATE_USERS])
+@pytest.mark.parametrize(
+    "name",
+    # The bootstrap filter is a part of the other particle filters.
+    [pytest.param(name, marks=pytest.mark.slow if name == "bootstrap" else ())
+     for name in (*IN_SEQUENCE, *LATE_USERS)],
+)  # fmt: skip
 def test_on_a_mildly_nonlinear_model(name):
     """The last measurement is late for the methods that can use it."""
     late = name in LATE_USERS

@@ -73,6 +73,7 @@ def regular(runs: int, steps: int, shared_time: bool = True) -> ej.Measurement:
 @pytest.fixture(params=[1, 16, 24], ids=["one_by_one", "dividing", "overlapping"])
 def groups(request, monkeypatch):
     monkeypatch.setattr(loops, "group_size", lambda *_: request.param)
+    return request.param
 
 
 def worlds(steps, shared):
@@ -98,6 +99,8 @@ def alone(steps, shared):
 @pytest.mark.parametrize("shared", ["nothing", "time", "all"])
 @pytest.mark.parametrize("steps", [7, 32], ids=["one_block", "blocks"])
 def test_neither_groups_of_runs_nor_blocks_of_steps_show(steps, shared, groups):
+    if groups == 1 and shared == "time":
+        pytest.skip("one by one, nothing is computed ahead: what is shared is passed like the rest")
     params, measurements = worlds(steps, shared)
     estimator, start = ej.kalman(MODEL), {"prior": PRIOR, "t0": 0.0}
     start["params_per_run"] = shared != "all"

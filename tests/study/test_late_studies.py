@@ -131,7 +131,9 @@ def test_what_the_extended_filter_gains_up_to_5_seconds():
     assert 0.05 < (rmse(five).value - least) / (most - least) < 0.3
 
 
-@pytest.mark.parametrize("number", [0, 1], ids=["Al1", "EWIF"])
+@pytest.mark.parametrize(
+    "number", [pytest.param(0, marks=pytest.mark.slow), 1], ids=["Al1", "EWIF"]
+)
 def test_what_is_learned_through_late_measurements_is_better_on_other_runs(number, tmp_path):
     """A short descent from the published setting; judged on runs that it has not seen."""
     one = tuning.methods()[number]._replace(grid=np.zeros(0))
