@@ -103,7 +103,7 @@ def array(x: Any, dtype: Any = None) -> jax.Array:
     """`x` as an array of JAX. Of an array of NumPy `jnp.asarray` makes it with a program, compiled
     for every shape; this makes it with none."""
     if isinstance(x, np.ndarray):
-        return jnp.array(x if dtype is None else x.astype(dtype))
+        return jax.device_put(np.array(x, dtype))  # of a copy, which nobody else can change
     return jnp.asarray(x, dtype)
 
 

@@ -617,6 +617,27 @@ def test_tables_are_looked_into_once_for_their_size_and_the_indices_they_hold():
             looks(rows, *where)
 
 
+def test_numpy_compiles_nothing_and_new_parameters_compile_nothing_again(caplog):
+    """Neither a stream of sizes that nobody has had, nor a filter of one that it has had."""
+    world = constant_velocity(sensors=position_sensor(0.5), q=lambda p: p["q"])
+    time, value = np.arange(157.0), np.sin(np.arange(157.0))
+    filters = ej.kalman(world), ej.ewif(world, lambda p: p["tau"])
+
+    def filtered(numbers, stream):
+        for estimator in filters:
+            params = {"q": np.array(numbers), "tau": np.array(numbers)}
+            ej.run(estimator, params, stream, prior=PRIOR, t0=0.0)
+
+    with jax.log_compiles():
+        stream = ej.stream(time, value)
+        assert not caplog.records
+        filtered(1.0, stream)
+        assert caplog.records
+        caplog.clear()
+        filtered(2.0, stream)
+        assert not [x for x in caplog.records if "Compiling" in x.message]
+
+
 def test_a_function_that_branches_on_the_sensor_is_not_a_table():
     model = ej.linear_model(
         SQUARE, lambda p, sensor, t: jnp.where(sensor == 0, 1.0, 2.0) * jnp.ones((1, 2)), np.eye(1)
