@@ -602,11 +602,11 @@ def test_tables_are_looked_into_once_for_their_size_and_the_indices_they_hold():
         asked.append(sensor)
         return p["H"][p["row"][sensor]]
 
-    estimator = ej.kalman(ej.linear_model(SQUARE, H, np.eye(1)))
+    estimator, rng = ej.kalman(ej.linear_model(SQUARE, H, np.eye(1))), np.random.default_rng(0)
 
     def looks(rows, *where):
         asked.clear()
-        params = {"H": np.random.default_rng().normal(size=(rows, 1, 2)), "row": np.array(where)}
+        params = {"H": rng.normal(size=(rows, 1, 2)), "row": np.array(where)}
         run(estimator, stream=swap(sensor=np.array([0, 1, 1])), params=params)
         return len(asked)
 
