@@ -18,6 +18,11 @@ def known(x: Any) -> np.ndarray | None:
     return None if isinstance(x, Tracer) else np.asarray(x)
 
 
+def with_dtype(x: Any) -> Any:
+    """`x` if it has a dtype, else (numbers, lists) as a NumPy array."""
+    return x if hasattr(x, "dtype") else np.asarray(x)
+
+
 def require(condition: Any, argument: str, expected: str, got: Any) -> None:
     """Raises a ValueError naming `argument` unless `condition` holds."""
     if not condition:
@@ -138,7 +143,7 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     """
     ok = isinstance(measurements, Measurement)
     require(ok, "measurements", "a Measurement", type(measurements).__name__)
-    time, value, sensor, mask = (x if hasattr(x, "dtype") else np.asarray(x) for x in measurements)
+    time, value, sensor, mask = map(with_dtype, measurements)
     lead = ("R", "T") if batched else ("T",)
 
     def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:

@@ -100,10 +100,10 @@ def run(
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
-    fields: list[Any] = [x if hasattr(x, "dtype") else np.asarray(x) for x in measurements]
+    measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = _prior(prior, float_dtype(measurements.value))
-    filtered = _compiled(fields[0].shape[0], state, key)
-    return filtered(estimator, params, Measurement(*fields), prior, t0, times, clock, key)
+    filtered = _compiled(measurements.time.shape[0], state, key)
+    return filtered(estimator, params, measurements, prior, t0, times, clock, key)
 
 
 def validated(
@@ -182,7 +182,7 @@ def initial(
 
 def float_dtype(x: Any) -> Any:
     """The float dtype that `x` has, or would be promoted to."""
-    dtype = jnp.result_type(x if hasattr(x, "dtype") else np.asarray(x))
+    dtype = jnp.result_type(checks.with_dtype(x))
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.asarray(0.0).dtype
 
 
@@ -265,8 +265,7 @@ def _filtered(
     clock: Clock,
     key: Any,
 ) -> Trace:
-    measurements = cast(measurements, float_dtype(measurements.value))
-    dtype = measurements.value.dtype
+    dtype = float_dtype(measurements.value)
     state = initial(estimator, params, prior, t0, dtype, key)
     times = None if times is None else jnp.asarray(times, dtype)
 
