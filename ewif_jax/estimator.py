@@ -213,15 +213,15 @@ def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurem
     value = value[:, None] if value.ndim == 1 else value
     checks.shape("value", value, ("T", "m"))
     dtype = float_dtype(value)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite
+        value = value.astype(dtype)
     mask = xp.isfinite(value) if mask is None else xp.asarray(mask, bool)
     mask = xp.broadcast_to(mask[:, None] if mask.ndim == 1 else mask, value.shape)
     checks.shape("time", time, (value.shape[0],))
     checks.resolvable(time, dtype)
     sensor = xp.broadcast_to(xp.asarray(sensor, np.int32), value.shape[:1])
     seen = xp.where(mask, value, 0)
-    return Measurement(
-        array(xp.asarray(time), dtype), array(seen, dtype), array(sensor), array(mask)
-    )
+    return Measurement(array(xp.asarray(time), dtype), array(seen), array(sensor), array(mask))
 
 
 def _prior(prior: Gaussian | None, dtype: Any) -> Gaussian | None:

@@ -657,6 +657,15 @@ def test_what_is_missing_may_be_nan():
     np.testing.assert_array_equal(ej.stream(STREAM.time, value).mask, np.isfinite(value))
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_float32_cannot_hold_is_missing():
+    with jax.enable_x64(False):
+        stream = ej.stream([1.0, 2.0], [1.0, 1e200])
+        assert {x.dtype.name for x in stream} == {"float32", "int32", "bool"}
+        np.testing.assert_array_equal(stream.mask[:, 0], [True, False])
+        np.testing.assert_array_equal(stream.value[:, 0], [1.0, 0.0])
+
+
 def test_a_measurement_older_than_t0_is_late_and_not_an_error():
     info = run(t0=0.25).info
     np.testing.assert_array_equal(
