@@ -7,7 +7,6 @@ computed once, ahead of the rest. Outside, runs lead.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.compiling import WIDE, quick_jit
 from ewif_jax.estimator import Clock, advance, float_dtype, initial, validated
 from ewif_jax.layout import (
     Frozen,
@@ -148,8 +148,7 @@ def _lowest(params: Any, flags: Any) -> set[int]:
     return {int(np.argmin(x)) for x in numbers if x is not None}
 
 
-@partial(jax.jit, static_argnames=("estimator", "flags", "clock", "observe", "devices", "complete"))
-def _run_batch(
+def _filtered(
     estimator: Estimator,
     inputs: Any,
     t0: Any,
@@ -177,6 +176,10 @@ def _run_batch(
         return seen
     time, mean, cov, info = seen
     return Trace(time, mean, cov, info, state)
+
+
+_STATIC = ("estimator", "flags", "clock", "observe", "devices", "complete")
+_run_batch = quick_jit(_filtered, _STATIC, WIDE)
 
 
 def _loop(

@@ -5,9 +5,11 @@ argument, what was expected and what came.
 """
 
 from typing import Any
+from weakref import WeakValueDictionary
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
 from ewif_jax.types import Gaussian, Measurement
@@ -45,18 +47,30 @@ def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
     same = len(got) == len(expected) and all(
         isinstance(e, str) or g == e for g, e in zip(got, expected, strict=True)
     )
-    wanted = "(" + ", ".join(map(str, expected)) + ("," if len(expected) == 1 else "") + ")"
-    require(same, argument, f"shape {wanted}", f"shape {got}")
+    if not same:
+        wanted = "(" + ", ".join(map(str, expected)) + ("," if len(expected) == 1 else "") + ")"
+        require(False, argument, f"shape {wanted}", f"shape {got}")
 
 
-def finite(argument: str, x: Any) -> None:
-    """Refuses a known array with NaN or infinity in it."""
-    value = known(x)
-    if value is not None:
-        require(_is_numeric(value), argument, "finite numbers", Shown(x))
-        if not _all_finite(value):
-            bad = ~np.isfinite(value)
-            require(not bad.any(), argument, "finite numbers", _first(value, bad))
+def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
+    """Refuses a known array with NaN or infinity in it (where a known mask holds, and `where` says
+    so). An array of JAX that was found to be finite cannot have changed."""
+    if isinstance(x, Tracer) or _FINITE.get(id(x)) is x:
+        return
+    value = np.asarray(x)
+    require(_is_numeric(value), argument, "finite numbers", Shown(x))
+    with np.errstate(all="ignore"):  # one fast pass; but a sum of squares may also overflow
+        good = bool(np.isfinite(np.vdot(value, value)))
+    asked = None if good else known(mask)
+    if asked is not None:
+        bad = ~np.isfinite(value) & asked
+        require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
+    if good and isinstance(x, Array):
+        _FINITE[id(x)] = x
+
+
+_FINITE: WeakValueDictionary[int, Array] = WeakValueDictionary()
+"""Arrays of JAX that were found to be finite, by their identity."""
 
 
 def positive(argument: str, x: Any) -> Any:
@@ -161,17 +175,7 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     integer = jnp.issubdtype(sensor.dtype, jnp.integer)
     require(integer, "measurements.sensor", "integers", sensor.dtype)
     finite("measurements.time", time)
-    seen_value, seen_mask = known(value), known(mask)
-    if seen_value is not None and seen_mask is not None:
-        require(_is_numeric(seen_value), "measurements.value", "numbers", seen_value.dtype)
-        if not _all_finite(seen_value):
-            bad = ~np.isfinite(seen_value) & seen_mask
-            require(
-                not bad.any(),
-                "measurements.value",
-                "finite numbers where mask is True (mask out what is missing)",
-                _first(seen_value, bad),
-            )
+    finite("measurements.value", value, mask, " where mask is True (mask out what is missing)")
     seen_sensor = known(sensor)
     if seen_sensor is not None:
         require(seen_sensor.min() >= 0, "measurements.sensor", "indices >= 0", seen_sensor.min())
@@ -220,12 +224,6 @@ def report_times(times: Any, steps: int) -> None:
 
 def _is_numeric(value: np.ndarray) -> bool:
     return jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
-
-
-def _all_finite(value: np.ndarray) -> bool:
-    """One fast pass: False may also mean that the sum of squares overflows."""
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(np.vdot(value, value)))
 
 
 def _plain(value: np.ndarray) -> Any:

@@ -99,6 +99,7 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
+    checks.stream(measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = _prior(prior, float_dtype(measurements.value))
@@ -116,9 +117,8 @@ def validated(
     clock: str,
     key: Any,
 ) -> Any:
-    """The shapes of the estimator's state, after everything that can be known now has been
-    checked."""
-    checks.stream(measurements)
+    """The shapes of the estimator's state, after everything else than the stream that can be known
+    now has been checked."""
     checks.prior(prior)
     checks.shape("t0", t0, ())
     checks.finite("t0", t0)

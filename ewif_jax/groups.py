@@ -1,6 +1,6 @@
 """Runs a few at a time: how many, and where a group puts what it shows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +10,18 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax.compiling import loops_are_joined
-from ewif_jax.layout import joined, parted
+from ewif_jax.dependence import Traced
+from ewif_jax.kernels.batched import turned_rows
+from ewif_jax.layout import joined, parted, runs_last
+
+
+class Portion(NamedTuple):
+    """What is done at once."""
+
+    runs: int
+    steps: int
+    together: bool
+    """Whether the loop over the steps will be one function."""
 
 
 class Place(NamedTuple):
@@ -28,35 +39,43 @@ def scan_in_blocks(
     state: Any,
     arrivals: Any,
     finish: Callable[[Any], Any],
+    portion: Portion,
     place: Place | None,
 ) -> tuple[Any, Any]:
     """`lax.scan` of `step`, and `finish` of what it stacks: `finish` moves the stacked axis from
     the front to place 1. Without a place for it the result has one of its own.
 
     The stack is finished a block of steps at a time, while it is in the cache, and put where it
-    belongs, as long rows: short ones are copied slowly.
+    belongs, as long rows: short ones are copied slowly. The portion's steps divide all steps.
     """
-    steps = jax.tree.leaves(arrivals)[0].shape[0]
-    block = _block(steps)
+    steps, block = jax.tree.leaves(arrivals)[0].shape[0], portion.steps
     if block == steps and place is None:
         state, seen = lax.scan(step, state, arrivals)
         return finish(seen), state
-    arrivals = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), arrivals)
+    numbered = jnp.arange(steps), arrivals
+    blocks = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), numbered)
+
+    def numbered_step(state: Any, numbered: Any) -> tuple[Any, Any]:
+        k, arrival = numbered
+        if portion.together:  # otherwise several threads would take part in reading from the whole
+            whole = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), arrivals)
+            arrival = jax.tree.map(like, arrival, whole)
+        return step(state, arrival)
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def several(state: Any, arrivals: Any) -> tuple[Any, Any]:
-        state, seen = lax.scan(step, state, arrivals)
+    def several(state: Any, numbered: Any) -> tuple[Any, Any]:
+        state, seen = lax.scan(numbered_step, state, numbered)
         return state, finish(seen)
 
-    one = jax.tree.map(lambda x: x[0], arrivals)
-    shapes = jax.eval_shape(several, state, one)[1]
+    first = jax.tree.map(lambda x: x[0], blocks)
+    shapes = jax.eval_shape(several, state, first)[1]
     shapes = jax.tree.map(lambda x: x.update(shape=(len(x), steps, *x.shape[2:])), shapes)
     whole, row, known = (rows(shapes), 0, 0) if place is None else place
 
     def put(carry: Any, numbered: Any) -> tuple[Any, None]:
         state, whole = carry
-        number, arrivals = numbered
-        state, seen = several(state, arrivals)
+        number, some = numbered
+        state, seen = several(state, some)
 
         def put_one(whole: Array, new: Array) -> Array:
             flat = new.reshape(len(new), -1)
@@ -64,8 +83,26 @@ def scan_in_blocks(
 
         return (state, jax.tree.map(put_one, whole, seen)), None
 
-    (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), arrivals))
+    (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), blocks))
     return (unrolled(whole, shapes) if place is None else whole), state
+
+
+def like(part: Array, same: Array) -> Array:
+    """`part` of an array, read from the whole as `same`, which saves a copy of the part; but its
+    slopes are those of the part: what is read from a whole adds slopes to all of it."""
+    floats = jnp.issubdtype(part.dtype, jnp.floating)
+    return _like(part, lax.stop_gradient(same)) if floats else same
+
+
+@jax.custom_jvp
+def _like(part: Array, same: Array) -> Array:
+    del part
+    return same
+
+
+@_like.defjvp
+def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    return primals[1], tangents[0]
 
 
 @jax.custom_jvp
@@ -98,22 +135,37 @@ def unrolled(whole: Any, shapes: Any) -> Any:
     return jax.tree.map(lambda x, shape: x.reshape(shape.shape), whole, shapes)
 
 
-def _block(steps: int) -> int:
-    """The largest divisor of `steps` up to 20, or all of them if there is no good one."""
-    best = max(d for d in range(1, min(steps, 20) + 1) if steps % d == 0)
+def block_size(steps: int, shown: int, together: bool) -> int:
+    """How many steps to take before what they show is put in its place: the largest divisor of
+    `steps` up to 20, or all of them if there is no good one. Up to 100 short ones, if what they
+    show stays in the second cache.
+
+    Args:
+        steps: how many there are.
+        shown: bytes of what one step shows, of all runs that are filtered at once.
+        together: whether steps are so short that their loop will be one function.
+    """
+    most = min(max(_BLOCK // max(shown, 1), 20), 100) if together else 20
+    best = max(d for d in range(1, min(most, steps) + 1) if steps % d == 0)
     return best if best >= 5 else steps
 
 
 def group_size(
-    runs: int, own: int, shared: int, largest: int, itemsize: int, draws: bool = False
+    runs: int,
+    own: int,
+    shared: int,
+    largest: int,
+    itemsize: int,
+    together: bool = False,
+    draws: bool = False,
 ) -> int:
     """How many runs to filter at once; 1 where a few would be too many (a state that large is a
     vector itself). What is no CPU takes all runs at once.
 
     The states stay in the second cache, and no array is so large that the compiler would have
     several threads wait for each other at every step. Where a loop is one function, so that
-    shorter vectors cost nothing, states stay in the first cache, unless most of a state is shared:
-    each group computes that again.
+    shorter vectors cost nothing, states stay in the first cache, and with them what a short step
+    computes; unless most of a state is shared: each group computes that again.
 
     Args:
         runs: how many there are.
@@ -121,13 +173,14 @@ def group_size(
         shared: bytes of what all runs share.
         largest: bytes of the largest array in a run's state or in its estimate.
         itemsize: bytes of a number.
+        together: whether a step is so short that its loop will be one function.
         draws: whether a state has random members, along which it is a vector sooner.
     """
     if jax.default_backend() != "cpu":
         return runs
     room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
     if own > shared and loops_are_joined():
-        room = min(room, max(_FIRST_CACHE // own, 128), 256)
+        room = min(room, max(_FIRST_CACHE // own, 128), 112 if together else 256)
     if room < (32 if draws else min(runs, 16)):
         return 1
     fewest = -(-runs // room)
@@ -135,6 +188,12 @@ def group_size(
     candidates = [size for size in sizes if min(room, 64) <= size <= min(room, runs)]
     candidates += [runs] * (runs <= room)
     return min(candidates, key=lambda size: _work(runs, size, itemsize), default=room)
+
+
+def goes_together(step: Traced) -> bool:
+    """Whether the loop over such steps, of about a hundred runs, will be one function."""
+    numbers = sum(v.aval.size for eqn in step.closed.jaxpr.eqns for v in eqn.outvars)
+    return loops_are_joined() and numbers < 1000
 
 
 def _odd_lines(size: int, itemsize: int) -> int:
@@ -151,7 +210,7 @@ def _work(runs: int, size: int, itemsize: int) -> float:
     return -(-runs // size) * size * (1 if lines % 2 == 1 else 1.25)
 
 
-_FIRST_CACHE, _SECOND_CACHE, _UNDIVIDED, _LINE = 2**15, 2**19, 2**18, 64
+_FIRST_CACHE, _SECOND_CACHE, _BLOCK, _UNDIVIDED, _LINE = 2**15, 2**19, 3 * 2**16, 2**18, 64
 
 
 def in_groups(
@@ -159,15 +218,32 @@ def in_groups(
     inputs: Any,
     flags: Any,
     runs: int,
-    size: int,
+    portion: Portion,
 ) -> tuple[Any, Any]:
-    """`fn` of `size` runs at a time, the leading axis of the flagged leaves that go in and of all
-    that come out: what is shown, which `fn` puts in its place, and the last states.
+    """`fn` of a few runs at a time: the last axis of the flagged leaves that go in (one run is no
+    axis), and the leading one of all that come out: what is shown, which `fn` puts in its place,
+    and the last states.
 
-    Groups overlap where `size` does not divide the runs.
+    Groups overlap where their size does not divide the runs.
     """
+    size = portion.runs
+    flagged, others = parted(inputs, flags)
+
+    def behind(some: Array, whole: Array, begin: Array | int) -> Array:
+        """Some runs of the whole, behind what each of them has."""
+        if size == 1:
+            return some[0]
+        last = runs_last(some, True)
+        if some.ndim == 1 or not portion.together:
+            return last
+        return like(last, turned_rows(whole.reshape(runs, -1), begin, size).reshape(last.shape))
+
+    def merged(group: Sequence[Array], begin: Array | int) -> Any:
+        own = [behind(some, whole, begin) for some, whole in zip(group, flagged, strict=True)]
+        return joined(own, others, flags)
+
     if size == runs:
-        return fn(inputs, None)
+        return fn(merged(flagged, 0), None)
     groups = -(-runs // size)
     begins = np.minimum(np.arange(groups) * size, runs - size)
 
@@ -177,15 +253,12 @@ def in_groups(
             x = jnp.concatenate([x[: begins[-2] + size], x[begins[-1] :]])
         return x.reshape(groups, size, *x.shape[1:])
 
-    def merged(group: list[Array]) -> Any:
-        return joined(group, parted(inputs, flags)[1], flags)
-
     def one(whole: Any, numbered: Any) -> tuple[Any, Any]:
         begin, known, group = numbered
-        return fn(merged(group), Place(whole, begin, known))
+        return fn(merged(group, begin), Place(whole, begin, known))
 
-    split = [grouped(x) for x in parted(inputs, flags)[0]]
-    shapes = jax.eval_shape(lambda group: fn(merged(group), None)[0], [x[0] for x in split])
+    split = [grouped(x) for x in flagged]
+    shapes = jax.eval_shape(lambda group: fn(merged(group, 0), None)[0], [x[0] for x in split])
     shapes = jax.tree.map(lambda x: x.update(shape=(runs, *x.shape[1:])), shapes)
     whole, last = lax.scan(one, rows(shapes), (begins, np.arange(groups) * size - begins, split))
     last = jax.tree.map(lambda x: x.reshape(groups * size, *x.shape[2:]), last)

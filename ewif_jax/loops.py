@@ -9,14 +9,21 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax.dependence import Divided, Traced, dependence, divided, traced
-from ewif_jax.groups import Place, group_size, in_groups, scan_in_blocks
+from ewif_jax.groups import (
+    Place,
+    Portion,
+    block_size,
+    goes_together,
+    group_size,
+    in_groups,
+    scan_in_blocks,
+)
 from ewif_jax.layout import (
     joined,
     one_run,
     parted,
     runs_adjacent,
     runs_first,
-    runs_last,
     vmap_last,
 )
 
@@ -53,16 +60,20 @@ def over_runs(
     differ = _that_differ(step, params_f, state_f, arrival_f)
     levels = _levels(params_f, 0), _levels(differ[0], 1), _levels(arrival_f, 1)
     parts = divided(step, levels, differ)
-    runs, _, m = inputs[1].value.shape
+    runs, steps, m = inputs[1].value.shape
     dtype = inputs[1].value.dtype
     ahead = 0 < parts.needed <= runs * m * dtype.itemsize  # no more memory than the values
     own, shared, largest = _sizes(state, differ[0], jax.eval_shape(estimate, params, state))
     of_key = dependence(start, (_alike(params_f), _alike(prior_f), key_f))
     draws = any(jax.tree.leaves(of_key))
-    size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize, draws)
+    together = goes_together(step)
+    size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize, together, draws)
+    shown = parted(step.outputs[1], differ[1])[0]
+    block = block_size(steps, size * sum(x.size * x.dtype.itemsize for x in shown), together)
+    portion = Portion(size, block, together)
     if ahead and 1 < size < runs:
-        return _shared_ahead(loop, parts, inputs, flags, differ, size)
-    return _in_groups(loop, inputs, flags, differ, size)
+        return _shared_ahead(loop, parts, inputs, flags, differ, portion)
+    return _in_groups(loop, inputs, flags, differ, portion)
 
 
 def _that_differ(step: Traced, params_f: Any, state_f: Any, arrival_f: Any) -> tuple[Any, Any]:
@@ -94,7 +105,12 @@ def _sizes(state: Any, state_f: Any, shown: Any) -> tuple[int, int, int]:
 
 
 def _shared_ahead(
-    loop: Loop, parts: Divided, inputs: Any, flags: Any, differ: tuple[Any, Any], size: int
+    loop: Loop,
+    parts: Divided,
+    inputs: Any,
+    flags: Any,
+    differ: tuple[Any, Any],
+    portion: Portion,
 ) -> tuple[Any, Any]:
     """What all runs share is computed first, once for all groups, which then read what they need
     of it at each arrival."""
@@ -128,22 +144,22 @@ def _shared_ahead(
         (params, measurements, prior, times, keys, (context, needed)),
         (*flags[:-1], (context_f, [False] * len(needed))),
         tuple([f for f in jax.tree.leaves(tree) if f] for tree in differ),
-        size,
+        portion,
     )
     for_all = [[jnp.broadcast_to(x, (runs, *x.shape)) for x in shared] for shared in (seen, last)]
     return joined(found[0], for_all[0], seen_f), joined(found[1], for_all[1], state_f)
 
 
 def _in_groups(
-    loop: Loop, inputs: Any, flags: Any, differ: Sequence[Any], size: int
+    loop: Loop, inputs: Any, flags: Any, differ: Sequence[Any], portion: Portion
 ) -> tuple[Any, Any]:
-    def together(inputs: Any, place: Place | None) -> tuple[Any, Any]:
-        if size > 1:
-            return _scanned(loop, runs_last(inputs, flags), flags, differ, size, place)
-        inputs, (alike, same) = one_run(inputs, flags), _alike((flags, differ))
-        return _scanned(loop, inputs, alike, same, size, place)
+    same = _alike((flags, differ))
 
-    return in_groups(together, inputs, flags, inputs[1].value.shape[0], size)
+    def group(inputs: Any, place: Place | None) -> tuple[Any, Any]:
+        inside, differ_inside = (flags, differ) if portion.runs > 1 else same
+        return _scanned(loop, inputs, inside, differ_inside, portion, place)
+
+    return in_groups(group, inputs, flags, inputs[1].value.shape[0], portion)
 
 
 def _alike(flags: Any) -> Any:
@@ -151,9 +167,15 @@ def _alike(flags: Any) -> Any:
 
 
 def _scanned(
-    loop: Loop, inputs: Any, flags: Any, differ: Sequence[Any], runs: int, place: Place | None
+    loop: Loop,
+    inputs: Any,
+    flags: Any,
+    differ: Sequence[Any],
+    portion: Portion,
+    place: Place | None,
 ) -> tuple[Any, Any]:
     """The same from inputs with the runs last."""
+    runs = portion.runs
     params, measurements, prior, times, keys, context = inputs
     params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
     state_f, seen_f = differ
@@ -170,6 +192,7 @@ def _scanned(
         start(params, prior, keys),
         (measurements, times, context),
         lambda seen: runs_first(seen, seen_f, runs),
+        portion,
         place,
     )
     return seen, runs_first(state, state_f, runs)

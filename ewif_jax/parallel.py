@@ -66,6 +66,7 @@ def run_parallel(
     known = method in ("blocked", "associative")
     checks.require(known, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
+    checks.stream(measurements)
     validated(estimator, params, measurements, prior, t0, times, "validity", None)
     measurements = cast(measurements, float_dtype(measurements.value))
     steps = measurements.value.shape[0]

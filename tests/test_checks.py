@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ewif_jax as ej
-from ewif_jax import Gaussian, Measurement
+from ewif_jax import Gaussian, Measurement, checks
 from ewif_jax.analysis.anderson import System
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
 from ewif_jax.continuous.kalman_bucy import Signal
@@ -640,6 +640,24 @@ def test_numpy_compiles_nothing_and_new_parameters_compile_nothing_again(caplog)
         assert compiled()
         filtered(2.0, stream)
         assert not compiled()
+
+
+def test_only_what_cannot_change_is_looked_at_once(monkeypatch):
+    looks = []
+    vdot = np.vdot
+    monkeypatch.setattr(np, "vdot", lambda a, b: looks.append(0) or vdot(a, b))
+    x = jnp.arange(3.0)
+    checks.finite("x", x)
+    checks.finite("x", x)
+    assert len(looks) == 1
+    changes = np.arange(3.0)
+    checks.finite("x", changes)
+    changes[1] = np.nan
+    with pytest.raises(ValueError, match="x: expected finite numbers, got nan at index 1"):
+        checks.finite("x", changes)
+    for _ in range(2):  # what was refused, or is gone, is not among them
+        with pytest.raises(ValueError, match="got inf at index 0"):
+            checks.finite("x", jnp.array([jnp.inf, 1.0]))
 
 
 def test_a_function_that_branches_on_the_sensor_is_not_a_table():

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.core import ShapedArray
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.experimental.xla_metadata import set_xla_metadata
@@ -81,6 +81,20 @@ def _turned(x: Array) -> Array:
 
 _ADJOINTS[_turned] = _turned
 _APART.add(_turned)
+
+
+def turned_rows(x: Array, begin: Array | int, size: int) -> Array:
+    """The transpose of `size` rows of a matrix from `begin` on, in one pass."""
+    return stage(_turned_rows(size), x, jnp.asarray(begin, jnp.int32), batch=0)
+
+
+@cache
+def _turned_rows(size: int) -> Function:
+    def rows(x: Array, begin: Array) -> Array:
+        return _turned(lax.dynamic_slice_in_dim(x, begin.reshape(()), size))
+
+    _APART.add(rows)
+    return rows
 
 
 @kernel

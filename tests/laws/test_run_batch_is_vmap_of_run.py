@@ -70,10 +70,16 @@ def regular(runs: int, steps: int, shared_time: bool = True) -> ej.Measurement:
     return ej.Measurement(time, rng.normal(size=(runs, steps, 2)), sensor, mask)
 
 
-@pytest.fixture(params=[1, 16, 24], ids=["one_by_one", "dividing", "overlapping"])
+@pytest.fixture(
+    params=[(1, False), (16, False), (24, False), (24, True)],
+    ids=["one_by_one", "dividing", "overlapping", "together"],
+)
 def groups(request, monkeypatch):
-    monkeypatch.setattr(loops, "group_size", lambda *_: request.param)
-    return request.param
+    size, together = request.param
+    monkeypatch.setattr(loops, "group_size", lambda *_: size)
+    monkeypatch.setattr(loops, "goes_together", lambda _: together)
+    monkeypatch.setattr(grouping, "_BLOCK", 1)  # several blocks, also of short steps
+    return size
 
 
 def worlds(steps, shared):
@@ -166,6 +172,18 @@ def test_gradients_go_through_groups_of_runs(steps, groups):
     np.testing.assert_allclose(forward, in_q, rtol=1e-10)
 
 
+def test_batches_can_be_mapped_over_parameters(groups):
+    """Short steps are read from the whole, at a place that all have in common."""
+    measurements, qs = regular(40, 20), np.array([0.2, 0.7])
+
+    def means(q):
+        return in_batch(ej.kalman(MODEL), {"q": q}, measurements).mean
+
+    found = jax.jit(jax.vmap(means))(qs)
+    wanted = one_by_one(ej.kalman(MODEL), {"q": qs[1]}, measurements).mean
+    np.testing.assert_allclose(found[1], wanted, rtol=1e-10, atol=1e-12)
+
+
 def test_reverse_mode_touches_the_whole_result_no_more_often_than_the_filter(groups):
     """Where a group clears or adds up its part of all runs, the time grows as their square."""
     measurements = regular(40, 20)
@@ -256,12 +274,12 @@ def shapes(equations):
 
 
 @pytest.mark.parametrize("runs", [5, 16, 17, 97, 1000, 1024, 10_000])
-@pytest.mark.parametrize("joined", [True, False])
-def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, monkeypatch):
+@pytest.mark.parametrize(("joined", "together"), [(True, True), (True, False), (False, False)])
+def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, together, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(grouping, "loops_are_joined", lambda: joined)
     for own, shared, largest, itemsize in ((108, 4, 144, 4), (216, 8, 288, 8), (1000, 0, 700, 4)):
-        size = grouping.group_size(runs, own, shared, largest, itemsize)
+        size = grouping.group_size(runs, own, shared, largest, itemsize, together)
         assert min(runs, 64) <= size <= runs
         assert size * (own + shared) <= grouping._SECOND_CACHE
         assert size * largest <= grouping._UNDIVIDED
@@ -271,7 +289,10 @@ def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, monkeyp
 
 
 def test_blocks_divide_the_steps():
-    assert [grouping._block(steps) for steps in (7, 96, 97, 1000)] == [7, 16, 97, 20]
+    some = (7, 96, 97, 1000)
+    assert [grouping.block_size(steps, 10**4, False) for steps in some] == [7, 16, 97, 20]
+    assert [grouping.block_size(steps, 1920, True) for steps in some] == [7, 96, 97, 100]
+    assert [grouping.block_size(steps, 10**5, True) for steps in some] == [7, 16, 97, 20]
 
 
 def test_raw_and_typed_keys_are_split_over_the_runs():
