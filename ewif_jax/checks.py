@@ -4,6 +4,7 @@ Every function looks only at values that are known now (not at tracers), and eve
 argument, what was expected and what came.
 """
 
+from functools import lru_cache
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -107,14 +108,20 @@ def psd(argument: str, x: Any, definite: bool = False) -> Any:
     square = value.ndim == 2 and value.shape[0] == value.shape[1]
     require(square, argument, "a square matrix", f"shape {value.shape}")
     finite(argument, value)
-    value = value.astype(float)
-    scale = max(np.abs(value).max(initial=0.0), np.finfo(float).tiny)
-    skew = np.abs(value - value.T).max(initial=0.0)
+    scale, skew, smallest = _spectrum(value.astype(float).tobytes(), len(value))
     require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")
-    smallest = np.linalg.eigvalsh((value + value.T) / 2).min(initial=np.inf)
     good = smallest > 0 if definite else smallest >= -1e-6 * scale
     require(good, argument, f"a {kind} matrix", f"smallest eigenvalue {smallest:.3g}")
     return x
+
+
+@lru_cache
+def _spectrum(raw: bytes, n: int) -> tuple[float, float, float]:
+    """The largest element of an (n, n) matrix, its asymmetry, and its smallest eigenvalue."""
+    value = np.frombuffer(raw).reshape(n, n)
+    scale = max(np.abs(value).max(initial=0.0), np.finfo(float).tiny)
+    skew = np.abs(value - value.T).max(initial=0.0)
+    return scale, skew, np.linalg.eigvalsh((value + value.T) / 2).min(initial=np.inf)
 
 
 def prior(prior: Gaussian | None, n: int | None = None) -> None:
@@ -199,7 +206,7 @@ def sensors(measurements: Measurement, count: int | None) -> None:
 def resolvable(times: Any, dtype: Any) -> None:
     """Refuses known times that `dtype` cannot tell apart (epoch seconds in float32)."""
     value = known(times)
-    if value is None or value.dtype.kind != "f" or value.size < 2:
+    if value is None or value.dtype.kind != "f" or value.dtype == dtype or value.size < 2:
         return
     rounded = value.astype(dtype).astype(value.dtype)
     merged = (np.diff(value) != 0) & (np.diff(rounded) == 0)

@@ -33,7 +33,7 @@ quarter longer with them."""
 
 _OPTIONS = "--xla_backend_extra_options"
 _WHOLE_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
-_WHOLE_LOOPS_BELOW = 1_500_000
+WHOLE_LOOPS_BELOW = 1_500_000
 """Bytes that a round of the loop reads and writes: less than the loop over blocks of a large batch,
 whose results are laid out faster by several threads."""
 
@@ -64,7 +64,7 @@ def prepare_cpu(devices: int | None = None) -> None:
         return  # a notebook's first cell may run again
     jax.config.update("jax_num_cpu_devices", count)
     if not chosen:
-        os.environ["XLA_FLAGS"] = f"{flags} {_OPTIONS}={_WHOLE_LOOPS}={_WHOLE_LOOPS_BELOW}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {_OPTIONS}={_WHOLE_LOOPS}={WHOLE_LOOPS_BELOW}".strip()
     _keep_memory()
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ewif_jax.compiling import loops_are_joined
+from ewif_jax.compiling import WHOLE_LOOPS_BELOW, loops_are_joined
 from ewif_jax.dependence import Traced
 from ewif_jax.kernels.batched import turned_rows
 from ewif_jax.layout import joined, parted, runs_last
@@ -180,7 +180,9 @@ def group_size(
         return runs
     room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
     if own > shared and loops_are_joined():
-        room = min(room, max(_FIRST_CACHE // own, 128), 112 if together else 256)
+        # A short step computes about as much again, three times.
+        least = max(_FIRST_CACHE // (4 * own), 112) if together else max(_FIRST_CACHE // own, 128)
+        room = min(room, least, 256)
     if room < (32 if draws else min(runs, 16)):
         return 1
     fewest = -(-runs // room)
@@ -188,6 +190,12 @@ def group_size(
     candidates = [size for size in sizes if min(room, 64) <= size <= min(room, runs)]
     candidates += [runs] * (runs <= room)
     return min(candidates, key=lambda size: _work(runs, size, itemsize), default=room)
+
+
+def _may_fail(size: int) -> bool:
+    """Whether a loop that reads and writes so many bytes might be compiled as one function, though
+    several threads would take part in that, which fails."""
+    return _UNDIVIDED // 2 <= size < WHOLE_LOOPS_BELOW // 2
 
 
 def goes_together(step: Traced) -> bool:
@@ -210,7 +218,7 @@ def _work(runs: int, size: int, itemsize: int) -> float:
     return -(-runs // size) * size * (1 if lines % 2 == 1 else 1.25)
 
 
-_FIRST_CACHE, _SECOND_CACHE, _BLOCK, _UNDIVIDED, _LINE = 2**15, 2**19, 3 * 2**16, 2**18, 64
+_FIRST_CACHE, _SECOND_CACHE, _BLOCK, _UNDIVIDED, _LINE = 2**15, 2**19, 200_000, 2**18, 64
 
 
 def in_groups(
@@ -234,7 +242,7 @@ def in_groups(
         if size == 1:
             return some[0]
         last = runs_last(some, True)
-        if some.ndim == 1 or not portion.together:
+        if some.ndim == 1 or not portion.together or _may_fail(some.size * some.dtype.itemsize):
             return last
         return like(last, turned_rows(whole.reshape(runs, -1), begin, size).reshape(last.shape))
 

@@ -52,6 +52,16 @@ text = program.lower(jnp.ones(300)).compile().as_text()
 found["whole"] = "xla_cpu_small_call" in text
 found["devices"] = len(jax.devices())
 
+# The loop over groups is short, and several threads take part in it: as one function it would fail.
+plane = ej.models.position_sensor(0.3, dims=2)
+plane = ej.models.constant_velocity(sensors=plane, q=0.2, dims=2)
+time = jnp.arange(300.0)
+long = ej.Measurement(time, jnp.cos(time[:, None] + jnp.arange(256.0).reshape(128, 1, 2)),
+                      jnp.zeros(300, int), jnp.ones((300, 2), bool))
+found["long"] = ej.run_batch(ej.kalman(plane), None, long, t0=0.0, devices=1,
+                             prior=ej.Gaussian(jnp.zeros(4), jnp.eye(4)),
+                             observe=lambda step, _: step.mean.sum())
+
 large = jax.jit(lambda x: x + 1)
 arrays = [jnp.zeros(5_000_000)]
 for k in range(40):
