@@ -127,7 +127,7 @@ def _known() -> bool:
     if jax.default_backend() != "cpu":
         return False
     try:
-        jax.jit(lambda: 0, compiler_options=dict(QUICKEST))()
+        jax.jit(lambda: 0, compiler_options={**QUICKEST, **WIDE})()
     except JaxRuntimeError:
         return False
     return True
