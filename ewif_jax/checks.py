@@ -59,7 +59,8 @@ def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
     if isinstance(x, Tracer) or _FINITE.get(id(x)) is x:
         return
     value = np.asarray(x)
-    require(_is_numeric(value), argument, "finite numbers", Shown(x))
+    got = value.dtype if value.ndim else Shown(x)
+    require(_is_numeric(value), argument, "finite numbers", got)
     with np.errstate(all="ignore"):  # one fast pass; but a sum of squares may also overflow
         good = bool(np.isfinite(np.vdot(value, value)))
     asked = None if good else known(mask)
