@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,24 +30,37 @@ def stream(workload: L1 | L2, devices: int = 1) -> ej.Measurement:
     """The workload's measurements, on their devices; times are shared by the runs where they are in
     the workload."""
     shape = workload.value.shape
-    mesh = Mesh(np.asarray(jax.devices()[:devices]), ("runs",))
-    split = NamedSharding(mesh, PartitionSpec("runs"))
-    return ej.Measurement(
-        workload.time,
-        jax.device_put(workload.value, split if devices > 1 else jax.devices()[0]),
-        np.zeros(shape[1], np.int32),
-        np.ones(shape[1:], bool),
+    return on_devices(
+        ej.Measurement(
+            workload.time, workload.value, np.zeros(shape[1], np.int32), np.ones(shape[1:], bool)
+        ),
+        ej.Measurement(np.ndim(workload.time) == 2, True, False, False),
+        devices,
     )
+
+
+def on_devices(tree: Any, per_run: Any, devices: int = 1) -> Any:
+    """The arrays of a pytree on the first devices, what is marked as per run split over them."""
+    if devices == 1:
+        return jax.device_put(tree, jax.devices()[0])
+    mesh = Mesh(np.asarray(jax.devices()[:devices]), ("runs",))
+    split, whole = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in (["runs"], []))
+    return jax.device_put(tree, jax.tree.map(lambda own: split if own else whole, per_run))
 
 
 def kalman_filter(workload: L1, devices: int = 1) -> Filter:
     """Return `kalman` through `run_batch`: the filtered means (runs, steps, 6)."""
+    params, prior = on_devices(
+        ({"q": workload.q}, ej.Gaussian(workload.prior_mean, workload.prior_cov)),
+        ({"q": workload.per_run}, ej.Gaussian(False, False)),
+        devices,
+    )
     return partial(
         run_batch,
         ej.kalman(model()),
-        {"q": workload.q},
+        params,
         stream(workload, devices),
-        prior=ej.Gaussian(workload.prior_mean, workload.prior_cov),
+        prior=prior,
         t0=0.0,
         params_per_run=workload.per_run,
         observe=seen_mean,

@@ -81,22 +81,41 @@ def run_batch(
     Returns:
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
     """
-    checks.stream(measurements, batched=True)
-    checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
+    input_flags, complete = _examined(
+        estimator, params, params_per_run, measurements, prior, t0, times, clock, key
+    )
     runs = np.shape(measurements.value)[0]
-    inputs, input_flags = flagged(params, params_per_run, measurements, prior, times)
-    check_runs(estimator, inputs, input_flags, t0, clock, key)
     flags = (
         *input_flags,
         None if key is None else True,
         broadcast_prefix(context_per_run, context),
     )
     keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
-    count = device_count(runs, devices, inputs)
-    inputs = on_devices((*inputs, keys, context), flags, count)
-    mask = checks.known(measurements.mask)
-    complete = mask is not None and bool(mask.all())
+    count = device_count(runs, devices)
+    inputs = on_devices((params, measurements, prior, times, keys, context), flags, count)
     return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, complete)
+
+
+@checks.once
+def _examined(
+    estimator: Estimator,
+    params: Any,
+    params_per_run: Any,
+    measurements: Measurement,
+    prior: Gaussian | None,
+    t0: Any,
+    times: Any,
+    clock: Clock,
+    key: Any,
+) -> tuple[Any, bool]:
+    """Which inputs differ by run, and whether it is known that nothing is masked; everything that
+    can be refused now is."""
+    checks.stream(measurements, batched=True)
+    checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
+    inputs, flags = flagged(params, params_per_run, measurements, prior, times)
+    check_runs(estimator, inputs, flags, t0, clock, key)
+    mask = checks.known(measurements.mask)
+    return flags, mask is not None and bool(mask.all())
 
 
 def _one_for_each(key: Any) -> bool:

@@ -4,10 +4,12 @@ Every function looks only at values that are known now (not at tracers), and eve
 argument, what was expected and what came.
 """
 
-from functools import lru_cache
+from collections.abc import Callable, Hashable
+from functools import lru_cache, wraps
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import ref
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -19,6 +21,34 @@ from ewif_jax.types import Gaussian, Measurement
 def known(x: Any) -> np.ndarray | None:
     """`x` as a NumPy array if its value is known now, else None."""
     return None if isinstance(x, Tracer) else np.asarray(x)
+
+
+def once(check: Callable[..., Any]) -> Callable[..., Any]:
+    """`check`, whose answer for the same arrays of JAX (they cannot change) and the same hashable
+    things is kept; what it refuses it refuses each time."""
+    answers: dict[Any, tuple[list[ref[Array]], Any]] = {}
+
+    @wraps(check)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        arrays = [x for x in leaves if isinstance(x, Array)]
+        if not arrays or len(leaves) > 100 or not all(map(_fixed, leaves)):
+            return check(*args, **kwargs)
+        asked = structure, *[id(x) if isinstance(x, Array) else (type(x), x) for x in leaves]
+        seen, answer = answers.get(asked, ([], None))
+        if not seen or any(known() is not x for known, x in zip(seen, arrays, strict=True)):
+            answer = check(*args, **kwargs)
+            if len(answers) >= 1000:
+                answers.clear()
+            answers[asked] = [ref(x) for x in arrays], answer
+        return answer
+
+    return call
+
+
+def _fixed(x: Any) -> bool:
+    """Whether it will stay what it is."""
+    return isinstance(x, Array | Hashable) and not isinstance(x, Tracer)
 
 
 def with_dtype(x: Any) -> Any:
@@ -55,24 +85,24 @@ def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
 
 def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
     """Refuses a known array with NaN or infinity in it (where a known mask holds, and `where` says
-    so). An array of JAX that was found to be finite cannot have changed."""
-    if isinstance(x, Tracer) or _FINITE.get(id(x)) is x:
+    so)."""
+    if isinstance(x, Tracer):
         return
     value = np.asarray(x)
     got = value.dtype if value.ndim else Shown(x)
     require(_is_numeric(value), argument, "finite numbers", got)
-    with np.errstate(all="ignore"):  # one fast pass; but a sum of squares may also overflow
-        good = bool(np.isfinite(np.vdot(value, value)))
-    asked = None if good else known(mask)
+    asked = None if _all_finite(x) else known(mask)
     if asked is not None:
         bad = ~np.isfinite(value) & asked
         require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
-    if good and isinstance(x, Array):
-        _FINITE[id(x)] = x
 
 
-_FINITE: WeakValueDictionary[int, Array] = WeakValueDictionary()
-"""Arrays of JAX that were found to be finite, by their identity."""
+@once
+def _all_finite(x: Any) -> bool:
+    """Whether they surely are: one fast pass; but a sum of squares may also overflow."""
+    value = np.asarray(x)
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.vdot(value, value)))
 
 
 def positive(argument: str, x: Any) -> Any:
@@ -157,6 +187,7 @@ def needs_key(key: Any, method: str) -> Any:
     return key
 
 
+@once
 def stream(measurements: Measurement, batched: bool = False) -> None:
     """Refuses a stream that is empty, ragged, or whose known numbers are not usable.
 

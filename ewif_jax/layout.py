@@ -122,7 +122,7 @@ def _mesh(devices: int) -> Mesh:
     return Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
 
 
-def device_count(runs: int, devices: int | None, inputs: Any) -> int:
+def device_count(runs: int, devices: int | None) -> int:
     """How many local devices to use: the largest number up to `devices` that divides `runs`.
 
     By default all, but one CPU inside another program. What that program adds up over devices they
@@ -131,7 +131,7 @@ def device_count(runs: int, devices: int | None, inputs: Any) -> int:
     limit = len(jax.local_devices())
     if devices is not None:
         limit = min(checks.whole("devices", devices, 1), limit)
-    elif jax.default_backend() == "cpu" and transformed(inputs):
+    elif jax.default_backend() == "cpu" and transformed():
         limit = 1
     return max(d for d in range(1, limit + 1) if runs % d == 0)
 

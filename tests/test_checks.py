@@ -14,6 +14,7 @@ import ewif_jax as ej
 from ewif_jax import Gaussian, Measurement, checks
 from ewif_jax.analysis.anderson import System
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
+from ewif_jax.batch import run_batch
 from ewif_jax.continuous.kalman_bucy import Signal
 from ewif_jax.models import (
     bearing_sensor,
@@ -658,6 +659,58 @@ def test_only_what_cannot_change_is_looked_at_once(monkeypatch):
     for _ in range(2):  # what was refused, or is gone, is not among them
         with pytest.raises(ValueError, match="got inf at index 0"):
             checks.finite("x", jnp.array([jnp.inf, 1.0]))
+
+
+def test_an_answer_is_kept_for_the_same_arrays_alone():
+    asked = []
+
+    @checks.once
+    def check(*args, **kwargs):
+        asked.append(args[1:])  # not the first: it shall be gone after its check
+        checks.require(kwargs.get("good", True), "good", "True", False)
+        return len(asked)
+
+    x, y = jnp.zeros(2), jnp.zeros(2)
+    assert [check(x, 1), check(x, 1), check((x,), 1), check(x, 1)] == [1, 1, 2, 1]
+    assert [check(y, 1), check(x, 1.0), check(x, True), check(1, x)] == [3, 4, 5, 6]
+    assert [check(x, good=True), check(x, good=True)] == [7, 7]
+    changes = np.zeros(2)
+    assert [check(x, changes), check(x, changes)] == [8, 9]
+    assert [check(2), check(2)] == [10, 11]  # no array: as quick as looking it up
+    for count in (12, 13):
+        with pytest.raises(ValueError, match="good: expected True, got False"):
+            check(x, good=False)
+        assert len(asked) == count
+    jax.jit(lambda t: check(t) * t)(1.0)
+    jax.jit(lambda t: check(t) * (t + 1))(1.0)
+    assert len(asked) == 15
+    for k in range(20):  # a new array may come to where an old one was
+        check(jnp.full(2, k))
+    assert len(asked) == 35
+
+
+def test_a_batch_looks_again_at_what_is_not_the_same():
+    stream = Measurement(*map(jnp.asarray, STREAM))
+    stream = stream._replace(value=jnp.ones((2, 3, 1)), sensor=jnp.zeros(3, jnp.int32))
+    model = constant_velocity(sensors=position_sensor(0.5))
+    estimator = ej.ewif(model, lambda tau: tau)
+
+    def means(tau, measurements=stream, t0=0.0):
+        return run_batch(
+            estimator, tau, measurements, prior=PRIOR, t0=t0, observe=lambda step, _: step.mean
+        )
+
+    tau, bad = jnp.asarray(0.2), jnp.asarray(-0.2)
+    np.testing.assert_array_equal(means(tau), means(tau))
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"tau: expected a positive number, got -0\.2"):
+            means(bad)
+        with pytest.raises(ValueError, match=r"measurement\.sensor: expected an index below 1"):
+            means(tau, stream._replace(sensor=jnp.array([0, 1, 0])))
+        with pytest.raises(ValueError, match="t0: expected finite numbers"):
+            means(tau, t0=np.inf)
+    masked = stream._replace(mask=jnp.zeros((3, 1), bool))
+    np.testing.assert_allclose(means(tau, masked)[0, -1], [0.3 - 0.3, -1.0], atol=1e-6)
 
 
 def test_a_function_that_branches_on_the_sensor_is_not_a_table():
