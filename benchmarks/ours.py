@@ -6,11 +6,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import ewif_jax as ej
 from benchmarks.workloads import L1, L2
 from ewif_jax.batch import run_batch
+from ewif_jax.layout import on_devices
 
 Filter = Callable[[], jax.Array]
 
@@ -30,7 +30,7 @@ def stream(workload: L1 | L2, devices: int = 1) -> ej.Measurement:
     """The workload's measurements, on their devices; times are shared by the runs where they are in
     the workload."""
     shape = workload.value.shape
-    return on_devices(
+    return placed(
         ej.Measurement(
             workload.time, workload.value, np.zeros(shape[1], np.int32), np.ones(shape[1:], bool)
         ),
@@ -39,18 +39,16 @@ def stream(workload: L1 | L2, devices: int = 1) -> ej.Measurement:
     )
 
 
-def on_devices(tree: Any, per_run: Any, devices: int = 1) -> Any:
+def placed(tree: Any, per_run: Any, devices: int = 1) -> Any:
     """The arrays of a pytree on the first devices, what is marked as per run split over them."""
     if devices == 1:
         return jax.device_put(tree, jax.devices()[0])
-    mesh = Mesh(np.asarray(jax.devices()[:devices]), ("runs",))
-    split, whole = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in (["runs"], []))
-    return jax.device_put(tree, jax.tree.map(lambda own: split if own else whole, per_run))
+    return on_devices(tree, per_run, devices)
 
 
 def kalman_filter(workload: L1, devices: int = 1) -> Filter:
     """Return `kalman` through `run_batch`: the filtered means (runs, steps, 6)."""
-    params, prior = on_devices(
+    params, prior = placed(
         ({"q": workload.q}, ej.Gaussian(workload.prior_mean, workload.prior_cov)),
         ({"q": workload.per_run}, ej.Gaussian(False, False)),
         devices,

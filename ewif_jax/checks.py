@@ -35,8 +35,8 @@ def once(check: Callable[..., Any]) -> Callable[..., Any]:
         if not arrays or len(leaves) > 100 or not all(map(_fixed, leaves)):
             return check(*args, **kwargs)
         asked = structure, *[id(x) if isinstance(x, Array) else (type(x), x) for x in leaves]
-        seen, answer = answers.get(asked, ([], None))
-        if not seen or any(known() is not x for known, x in zip(seen, arrays, strict=True)):
+        before, answer = answers.get(asked, ([], None))
+        if not before or any(was() is not x for was, x in zip(before, arrays, strict=True)):
             answer = check(*args, **kwargs)
             if len(answers) >= 1000:
                 answers.clear()

@@ -11,10 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ewif_jax as ej
-from ewif_jax import Gaussian, Measurement, checks
+from ewif_jax import Gaussian, Measurement, batch, checks
 from ewif_jax.analysis.anderson import System
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
-from ewif_jax.batch import run_batch
 from ewif_jax.continuous.kalman_bucy import Signal
 from ewif_jax.models import (
     bearing_sensor,
@@ -689,19 +688,24 @@ def test_an_answer_is_kept_for_the_same_arrays_alone():
     assert len(asked) == 35
 
 
-def test_a_batch_looks_again_at_what_is_not_the_same():
+def test_a_batch_looks_again_at_what_is_not_the_same(monkeypatch):
+    looks = []
+    look = batch.check_runs
+    monkeypatch.setattr(batch, "check_runs", lambda *args: looks.append(0) or look(*args))
     stream = Measurement(*map(jnp.asarray, STREAM))
     stream = stream._replace(value=jnp.ones((2, 3, 1)), sensor=jnp.zeros(3, jnp.int32))
+    prior = Gaussian(*map(jnp.asarray, PRIOR))
     model = constant_velocity(sensors=position_sensor(0.5))
     estimator = ej.ewif(model, lambda tau: tau)
 
     def means(tau, measurements=stream, t0=0.0):
-        return run_batch(
-            estimator, tau, measurements, prior=PRIOR, t0=t0, observe=lambda step, _: step.mean
+        return batch.run_batch(
+            estimator, tau, measurements, prior=prior, t0=t0, observe=lambda step, _: step.mean
         )
 
     tau, bad = jnp.asarray(0.2), jnp.asarray(-0.2)
     np.testing.assert_array_equal(means(tau), means(tau))
+    assert len(looks) == 1
     for _ in range(2):
         with pytest.raises(ValueError, match=r"tau: expected a positive number, got -0\.2"):
             means(bad)
