@@ -15,11 +15,12 @@ import numpy as np
 
 from benchmarks.timing import measure, report
 from benchmarks.workloads import long_series
-from ewif_jax.compiling import prepare_cpu
-from ewif_jax.estimator import run, stream
+from ewif_jax.estimator import run
 from ewif_jax.estimators.ewif import ewif
+from ewif_jax.fast.compiling import prepare_cpu
 from ewif_jax.models import constant_acceleration, position_sensor
 from ewif_jax.parallel import run_parallel
+from ewif_jax.streams import stream
 
 OUTPUT = Path(__file__).parent / "results" / "parallel.json"
 TAU = 2.0

@@ -10,7 +10,7 @@ import numpy as np
 import ewif_jax as ej
 from benchmarks.workloads import L1, L2
 from ewif_jax.batch import run_batch
-from ewif_jax.layout import on_devices
+from ewif_jax.fast.layout import on_devices
 
 Filter = Callable[[], jax.Array]
 

@@ -32,10 +32,9 @@ from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
 from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
 from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
-from ewif_jax.compiling import prepare_cpu
 from ewif_jax.continuous.error import actual_error_continuous, error_bounds_continuous
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
-from ewif_jax.estimator import run, step, stream
+from ewif_jax.estimator import run, step
 from ewif_jax.estimators.bootstrap import bootstrap
 from ewif_jax.estimators.ensemble import ensemble
 from ewif_jax.estimators.ewif import ewif
@@ -46,7 +45,7 @@ from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
-from ewif_jax.forms.ensembles import fuse_ensembles
+from ewif_jax.fast.compiling import prepare_cpu
 from ewif_jax.models import Model, linear_model
 from ewif_jax.monte_carlo import (
     Scenario,
@@ -70,11 +69,13 @@ from ewif_jax.oosm.replay import replay
 from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
 from ewif_jax.parallel import run_parallel
+from ewif_jax.recursions.ensembles import fuse_ensembles
 from ewif_jax.smoothers.batch_wls import batch_wls
 from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
 from ewif_jax.smoothers.rts import rts
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
+from ewif_jax.streams import stream
 from ewif_jax.tuning import (
     Transform,
     Tuned,

@@ -15,9 +15,10 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.compiling import WIDE, quick_jit
-from ewif_jax.estimator import Clock, advance, float_dtype, initial, validated
-from ewif_jax.layout import (
+from ewif_jax.arrival import arrive, initial
+from ewif_jax.estimator import Clock
+from ewif_jax.fast.compiling import WIDE, quick_jit
+from ewif_jax.fast.layout import (
     Frozen,
     broadcast_prefix,
     device_count,
@@ -25,7 +26,9 @@ from ewif_jax.layout import (
     one_run,
     over_devices,
 )
-from ewif_jax.loops import Loop, over_runs
+from ewif_jax.fast.loops import Loop, over_runs
+from ewif_jax.streams import float_dtype
+from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
 
@@ -212,7 +215,7 @@ def _loop(
         if complete:
             measurement = measurement._replace(mask=jnp.ones(measurement.mask.shape, bool))
         to = time if clock == "arrival" else None
-        moved = advance(estimator, params, state, measurement, to)
+        moved = arrive(estimator, params, state, measurement, to)
         shown = moved.reported
         if time is not None and clock == "validity":
             shown = estimator.predict(params, shown, time)

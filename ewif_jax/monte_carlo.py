@@ -10,9 +10,9 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.dependence import dependence, traced
 from ewif_jax.estimator import Clock
-from ewif_jax.layout import Frozen, broadcast_prefix
+from ewif_jax.fast.dependence import dependence, traced
+from ewif_jax.fast.layout import Frozen, broadcast_prefix
 from ewif_jax.scores import Score, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 

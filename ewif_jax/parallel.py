@@ -10,13 +10,15 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import advance, cast, float_dtype, initial, validated
+from ewif_jax.arrival import arrive, initial
 from ewif_jax.estimators.ewif import ewif
-from ewif_jax.forms import information as form
-from ewif_jax.forms import passage as way
-from ewif_jax.forms.information import InformationState
-from ewif_jax.forms.passage import Passage
 from ewif_jax.models.model import Model, resolve
+from ewif_jax.recursions import information as form
+from ewif_jax.recursions import passage as way
+from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.passage import Passage
+from ewif_jax.streams import cast, float_dtype
+from ewif_jax.trial import validated
 from ewif_jax.types import Gaussian, Measurement, Trace
 
 Method = Literal["blocked", "associative"]
@@ -115,7 +117,7 @@ def _run_parallel(
 
     def lengthen(stretch: Stretch, measurement: Measurement) -> Stretch:
         state, passed = stretch
-        kept = advance(estimator, params, state, measurement).kept
+        kept = arrive(estimator, params, state, measurement).kept
         leg = way.passage(model, params, squared, state.time, kept.time, dtype)
         return kept, way.then(passed, leg)
 
@@ -125,7 +127,7 @@ def _run_parallel(
 
     def filtered(state: InformationState, arrival: tuple[Measurement, Any]) -> tuple[Any, Any]:
         measurement, time = arrival
-        moved = advance(estimator, params, state, measurement)
+        moved = arrive(estimator, params, state, measurement)
         shown = moved.reported
         if time is not None:
             shown = estimator.predict(params, shown, time)

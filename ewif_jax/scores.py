@@ -16,8 +16,9 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.analysis.consistency import nees, nis
 from ewif_jax.batch import Observer, Step, run_batch
-from ewif_jax.compiling import array
-from ewif_jax.estimator import Clock, float_dtype
+from ewif_jax.estimator import Clock
+from ewif_jax.fast.compiling import array
+from ewif_jax.streams import float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]

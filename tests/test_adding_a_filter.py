@@ -15,7 +15,7 @@ GUIDE = (Path(__file__).parents[1] / "docs" / "adding-a-filter.md").read_text()
 FILE, EXPORT, ROW = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
 KALMAN = '''
 """Kalman again."""
-from ewif_jax.forms.covariance import covariance_form
+from ewif_jax.recursions.covariance import covariance_form
 def again(model):
     """The Kalman filter under another name."""
     return covariance_form(model, "again")

@@ -11,7 +11,7 @@ import pytest
 from apart import FLAGS_OF_THE_TESTS, SOON_FAST
 
 import ewif_jax as ej
-from ewif_jax import compiling
+from ewif_jax.fast import compiling
 
 CHILD = """
 import resource

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ewif_jax as ej
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import pattern
 from ewif_jax.kernels import symmetric
-from ewif_jax.kernels.small import matmul, matvec
-from ewif_jax.kernels.sparse import pattern
 from ewif_jax.models import patterns
 
 RUNS, N = 5, 4

@@ -12,7 +12,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.riccati import gain
 from ewif_jax.analysis.stabilising import discrete_lyapunov, stabilising_dare
 from ewif_jax.analysis.stability import require_steady_state
-from ewif_jax.estimator import float_dtype
+from ewif_jax.streams import float_dtype
 
 
 class System(NamedTuple):

@@ -10,7 +10,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.analysis.stabilising import continuous_lyapunov, stabilising_care
 from ewif_jax.analysis.stability import require_steady_state
-from ewif_jax.estimator import float_dtype
+from ewif_jax.streams import float_dtype
 
 
 class ContinuousSystem(NamedTuple):

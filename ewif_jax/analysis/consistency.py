@@ -9,7 +9,7 @@ from jax import Array
 from jax.scipy.special import gammainc
 
 from ewif_jax import checks
-from ewif_jax.compiling import array
+from ewif_jax.fast.compiling import array
 from ewif_jax.kernels import cholesky
 from ewif_jax.types import Info
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, float_dtype
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.models import Model
+from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Measurement
 
 

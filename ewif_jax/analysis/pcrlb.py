@@ -9,10 +9,11 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, choose, float_dtype
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian
-from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, flow, sight
+from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Measurement
 
 Bound = tuple[Array, Array, Array]

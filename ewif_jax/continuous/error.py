@@ -19,8 +19,8 @@ from ewif_jax.continuous.kalman_bucy import (
     solve,
     split,
 )
-from ewif_jax.estimator import float_dtype
 from ewif_jax.kernels import symmetric
+from ewif_jax.streams import float_dtype
 
 
 class ErrorCurve(NamedTuple):

@@ -12,8 +12,8 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem, check_continuous
-from ewif_jax.estimator import float_dtype
 from ewif_jax.kernels import symmetric
+from ewif_jax.streams import float_dtype
 from ewif_jax.types import Gaussian
 
 

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
-from ewif_jax.forms import ensembles
-from ewif_jax.forms.ensembles import EnsembleState
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recursions import ensembles
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.ensembles import EnsembleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 FORMS = ("stochastic", "square_root")

@@ -1,8 +1,8 @@
 """The extended Kalman filter."""
 
 from ewif_jax import checks
-from ewif_jax.forms.covariance import covariance_form
 from ewif_jax.models.model import Model
+from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 
 

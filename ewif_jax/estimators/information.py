@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import verdict
-from ewif_jax.forms import information as form
-from ewif_jax.forms.information import InformationState
 from ewif_jax.kernels import symmetric
 from ewif_jax.models.model import Model, affine_flow, need_linear
+from ewif_jax.recursions import information as form
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

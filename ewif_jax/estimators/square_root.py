@@ -6,10 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
 from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.kernels.trees import choose
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, flow, need_linear, sight
+from ewif_jax.recursions.contract import verdict
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
-from ewif_jax.forms.covariance import CovarianceState, covariance_form
-from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.kernels import symmetric
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.covariance import CovarianceState, covariance_form
+from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 

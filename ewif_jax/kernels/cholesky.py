@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax.kernels.batched import kernel, stage
+from ewif_jax.fast.batched import kernel, stage
 
 
 class Factor(NamedTuple):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ewif_jax.fast.batched import kernel, total
+from ewif_jax.fast.small import matmul
+from ewif_jax.fast.sparse import Pattern, by_row, full, multiplied
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.batched import kernel, total
-from ewif_jax.kernels.small import matmul
-from ewif_jax.kernels.sparse import Pattern, by_row, full, multiplied
 
 
 class Innovation(NamedTuple):

@@ -2,8 +2,8 @@
 
 from jax import Array
 
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky
-from ewif_jax.kernels.small import matmul
 
 
 def bridge(Q_before: Array, F_after: Array, Q_after: Array) -> tuple[Array, Array]:

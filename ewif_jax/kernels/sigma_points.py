@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jax import Array
 
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky
-from ewif_jax.kernels.small import matmul
 
 
 def offsets(lower: Array, scale: Array) -> Array:

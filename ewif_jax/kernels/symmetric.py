@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ewif_jax.kernels.batched import kernel, linear_kernel, smallest, stage, total
-from ewif_jax.kernels.small import matvec
-from ewif_jax.kernels.sparse import Pattern, by_row, full, multiplied
+from ewif_jax.fast.batched import kernel, linear_kernel, smallest, stage, total
+from ewif_jax.fast.small import matvec
+from ewif_jax.fast.sparse import Pattern, by_row, full, multiplied
 
 
 def order(packed: Array) -> int:

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from ewif_jax.fast.batched import kernel, stage, total
+from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky
-from ewif_jax.kernels.batched import kernel, stage, total
-from ewif_jax.kernels.small import matvec
 
 
 class Kept(NamedTuple):

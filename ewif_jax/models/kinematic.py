@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels.batched import kernel
-from ewif_jax.kernels.sparse import Pattern, pattern
+from ewif_jax.fast.batched import kernel
+from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.model import Linear, Model, affine_motion, resolve
 from ewif_jax.models.sensors import Sensor, bank
 

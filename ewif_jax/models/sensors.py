@@ -8,8 +8,8 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.compiling import array
-from ewif_jax.kernels.sparse import Pattern, pattern
+from ewif_jax.fast.compiling import array
+from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.model import resolve, select
 
 

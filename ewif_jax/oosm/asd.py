@@ -8,12 +8,14 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, copies, verdict
-from ewif_jax.forms.innovations import Compared, sound
-from ewif_jax.kernels import cholesky, gaussian, slots, symmetric, window
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.fast import slots
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.kernels import cholesky, gaussian, symmetric, window
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.innovations import Compared, sound
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 

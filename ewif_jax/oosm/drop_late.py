@@ -3,7 +3,7 @@
 from typing import Any
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose
+from ewif_jax.kernels.trees import choose
 from ewif_jax.oosm.history import too_late
 from ewif_jax.types import Estimator, Info, Measurement
 

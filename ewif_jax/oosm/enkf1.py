@@ -4,8 +4,8 @@ from typing import Any
 
 from jax import Array
 
-from ewif_jax.forms.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.models import Model
+from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.types import Estimator
 
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.forms import ensembles
-from ewif_jax.forms.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.models import Model
+from ewif_jax.recursions import ensembles
+from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.types import Estimator
 
 NOISES = ("fresh", "shared")

@@ -7,12 +7,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, copies, verdict
-from ewif_jax.forms.covariance import CovarianceState, covariance_form
-from ewif_jax.forms.innovations import Compared, updated
-from ewif_jax.kernels import cholesky, slots, symmetric
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.fast import slots
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.covariance import CovarianceState, covariance_form
+from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import copies
-from ewif_jax.forms import particles as form
+from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.small import matvec
+from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, flow
+from ewif_jax.recursions import particles as form
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

@@ -7,19 +7,19 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import copies
-from ewif_jax.forms import particles as form
-from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.forms.fixed_point import Conditional, fixed_point, given
-from ewif_jax.forms.innovations import numbers
-from ewif_jax.forms.particle_smoother import lines, look_back
-from ewif_jax.forms.particles import Seen
-from ewif_jax.forms.sigma_points import SigmaPoints, transform
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, sight
 from ewif_jax.oosm.history import last_before
+from ewif_jax.recursions import particles as form
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.fixed_point import Conditional, fixed_point, given
+from ewif_jax.recursions.innovations import numbers
+from ewif_jax.recursions.particle_smoother import lines, look_back
+from ewif_jax.recursions.particles import Seen
+from ewif_jax.recursions.sigma_points import SigmaPoints, transform
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 Smoother = Literal["eks", "uks", "ps"]
@@ -59,9 +59,10 @@ def pf_fixed_point(
             dx_\tau \quad (23)
 
     Orguner & Gustafsson (18)-(49). The smoothed density is a Gaussian with (27)-(29) for the
-    integral, by linearisation ("eks") or by sigma points ("uks"), see `forms.fixed_point`; or it is
-    `smoother_particles` weighted points ("ps"), see `forms.particle_smoother`. One smoother runs
-    for all particles; each then costs one product ("eks", "uks") or one row of densities ("ps").
+    integral, by linearisation ("eks") or by sigma points ("uks"), see `recursions.fixed_point`; or
+    it is `smoother_particles` weighted points ("ps"), see `recursions.particle_smoother`. One
+    smoother runs for all particles; each then costs one product ("eks", "uks") or one row of
+    densities ("ps").
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. R must be

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax.forms import particles as form
-from ewif_jax.forms.particles import ParticleState, Seen
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
+from ewif_jax.recursions import particles as form
+from ewif_jax.recursions.particles import ParticleState, Seen
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

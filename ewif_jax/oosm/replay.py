@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import advance, choose
-from ewif_jax.forms.partial_use import partly
+from ewif_jax.arrival import arrive
+from ewif_jax.kernels.trees import choose
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recursions.partial_use import partly
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
@@ -86,7 +87,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
             measured, share = entry
             cut = measured._replace(value=measured.value[:size], mask=measured.mask[:size])
             method = estimator if share is None else partly(estimator, share)
-            moved = advance(method, params, at, cut)
+            moved = arrive(method, params, at, cut)
             return moved.kept, moved.info
 
         oldest, rest = (jax.tree.map(lambda x, k=k: x[k], sorted_in) for k in (0, slice(1, None)))

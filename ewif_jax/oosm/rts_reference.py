@@ -6,13 +6,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose
-from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Info, Measurement
 
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose
-from ewif_jax.forms.partial_use import partly, prepared
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import resolve
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recursions.partial_use import partly, prepared
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import float_dtype
+from ewif_jax.streams import float_dtype
 from ewif_jax.types import Measurement
 
 

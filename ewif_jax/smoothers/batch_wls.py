@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, float_dtype
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, affine_flow, need_linear, observation
+from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
 Weight = Callable[[Any, Array, Array], Array]

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, verdict
 from ewif_jax.estimators.ewif import ewif
-from ewif_jax.forms.information import InformationState
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian
-from ewif_jax.kernels.small import matmul
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model, flow, resolve, sight
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 

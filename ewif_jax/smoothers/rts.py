@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, float_dtype
-from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around, transform
+from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models.model import Model
+from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
+from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
 FORMS = ("extended", "unscented")

@@ -9,9 +9,9 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import stream
 from ewif_jax.models.model import Model, linear_model
 from ewif_jax.smoothers.batch_wls import batch_wls
+from ewif_jax.streams import stream
 
 
 def savgol(

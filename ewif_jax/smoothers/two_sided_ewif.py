@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import cast, float_dtype
-from ewif_jax.forms import information as form
-from ewif_jax.forms.information import InformationState
-from ewif_jax.forms.passage import joined
 from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.recursions import information as form
+from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.passage import joined
+from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
 

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import jax
 
-from ewif_jax.compiling import prepare_cpu
+from ewif_jax.fast.compiling import prepare_cpu
 from ewif_jax.study.arguments import parser
 from ewif_jax.study.registry import STUDIES
 

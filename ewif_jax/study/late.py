@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from ewif_jax.batch import Step
-from ewif_jax.compiling import array
 from ewif_jax.estimators.kalman import kalman
+from ewif_jax.fast.compiling import array
 from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.scores import Score, average, scored, squared_error

@@ -9,7 +9,7 @@ import optax
 import pandas as pd
 import xarray as xr
 
-from ewif_jax.compiling import array
+from ewif_jax.fast.compiling import array
 from ewif_jax.study import track_figures
 from ewif_jax.study.experiment import Experiment, Options, Refused
 from ewif_jax.study.readings import Readings, read

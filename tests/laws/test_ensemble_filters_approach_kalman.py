@@ -14,9 +14,9 @@ from oracles.enkf import enkf_limit
 
 import ewif_jax as ej
 from ewif_jax.estimators.ensemble import ensemble
-from ewif_jax.forms.ensembles import fuse_ensembles
 from ewif_jax.oosm.enkf1 import enkf1
 from ewif_jax.oosm.enkf2 import enkf2
+from ewif_jax.recursions.ensembles import fuse_ensembles
 
 LAG, RUNS = 3, 64
 PROBLEM = problem(3, 3, 1)

@@ -8,13 +8,13 @@ from late_streams import exact, problem, stream
 from oracles.joint_gaussian import posterior
 
 import ewif_jax as ej
-from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.forms.fixed_point import fixed_point, given
-from ewif_jax.forms.particle_smoother import lines, look_back
-from ewif_jax.forms.particles import ParticleState
-from ewif_jax.forms.sigma_points import SigmaPoints
 from ewif_jax.kernels import symmetric
 from ewif_jax.oosm.pf_fixed_point import pf_fixed_point
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.fixed_point import fixed_point, given
+from ewif_jax.recursions.particle_smoother import lines, look_back
+from ewif_jax.recursions.particles import ParticleState
+from ewif_jax.recursions.sigma_points import SigmaPoints
 
 TIMES = np.array([0.5, 1.0, 1.5, 2.0])
 NOW = 2.5

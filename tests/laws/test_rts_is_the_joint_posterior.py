@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from oracles.joint_gaussian import posterior
 
-from ewif_jax.estimator import run, stream
+from ewif_jax.estimator import run
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.models import bearing_sensor, constant_velocity
 from ewif_jax.smoothers.rts import rts
+from ewif_jax.streams import stream
 from ewif_jax.types import Gaussian
 from laws.cases import STEPS, case, close, model
 

@@ -9,9 +9,9 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import ewif_jax as ej
-from ewif_jax import groups as grouping
-from ewif_jax import loops
 from ewif_jax import scores as scores_of
+from ewif_jax.fast import groups as grouping
+from ewif_jax.fast import loops
 from ewif_jax.scores import scored
 
 RUNS, STEPS = 5, 12

@@ -10,9 +10,9 @@ from oracles.unscented import unscented_smoother
 
 import ewif_jax as ej
 from ewif_jax.estimators.unscented import unscented
-from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around
 from ewif_jax.kernels import symmetric
 from ewif_jax.models import bearing_sensor, constant_velocity, position_sensor
+from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around
 from ewif_jax.smoothers.rts import rts
 
 SETTINGS = {"ut_alpha": 0.7, "ut_beta": 2.0, "ut_kappa": 1.0}

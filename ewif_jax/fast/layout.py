@@ -11,8 +11,8 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ewif_jax import checks
-from ewif_jax.compiling import transformed
-from ewif_jax.kernels.batched import contiguous, turned
+from ewif_jax.fast.batched import contiguous, turned
+from ewif_jax.fast.compiling import transformed
 
 
 def vmap_last(

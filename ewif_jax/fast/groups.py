@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ewif_jax.compiling import WHOLE_LOOPS_BELOW, loops_are_joined
-from ewif_jax.dependence import Traced
-from ewif_jax.kernels.batched import turned_rows
-from ewif_jax.layout import joined, parted, runs_last
+from ewif_jax.fast.batched import turned_rows
+from ewif_jax.fast.compiling import WHOLE_LOOPS_BELOW, loops_are_joined
+from ewif_jax.fast.dependence import Traced
+from ewif_jax.fast.layout import joined, parted, runs_last
 
 
 class Portion(NamedTuple):

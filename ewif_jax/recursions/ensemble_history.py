@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose, copies, verdict
-from ewif_jax.forms import ensembles
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model
+from ewif_jax.recursions import ensembles
+from ewif_jax.recursions.contract import verdict
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 

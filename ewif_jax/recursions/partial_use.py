@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.forms import information
-from ewif_jax.forms.information import InformationState
+from ewif_jax.recursions import information
+from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Info, Measurement
 
 

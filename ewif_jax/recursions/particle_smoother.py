@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax.forms import particles as form
-from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.forms.particles import Seen
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import matmul
 from ewif_jax.models import Model
+from ewif_jax.recursions import particles as form
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.particles import Seen
 from ewif_jax.types import Measurement
 
 BLOCK = 256

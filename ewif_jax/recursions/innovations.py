@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from ewif_jax.fast.small import matmul
+from ewif_jax.fast.sparse import Pattern
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.small import matmul
-from ewif_jax.kernels.sparse import Pattern
 from ewif_jax.models.model import Model
 from ewif_jax.types import Info, Status
 

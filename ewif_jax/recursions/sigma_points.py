@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose
-from ewif_jax.forms.covariance import measure, unseen
-from ewif_jax.forms.innovations import Compared, updated
 from ewif_jax.kernels import cholesky, sigma_points, symmetric
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model, flow, resolve
 from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.recursions.covariance import measure, unseen
+from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Info, Measurement
 
 ROUNDING = 1e-4
@@ -96,7 +96,7 @@ def measure_around(
     measurement: Measurement,
     still: int = 0,
 ) -> tuple[Array, Array, Info]:
-    """`forms.covariance.measure` with the measurement's moments by `points`."""
+    """`recursions.covariance.measure` with the measurement's moments by `points`."""
     if points is None:
         return measure(model, params, mean, cov, measurement, still)
     sensor = measurement.sensor

@@ -12,10 +12,10 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.fast.batched import kernel, largest, total
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import transposed
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.batched import kernel, largest, total
-from ewif_jax.kernels.small import matmul, matvec
-from ewif_jax.kernels.sparse import transposed
 from ewif_jax.models import Model
 from ewif_jax.models.model import affine_flow, observation, patterns, size
 from ewif_jax.types import Gaussian, Info, Measurement

@@ -8,11 +8,11 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimator import verdict
-from ewif_jax.forms.innovations import Compared, updated
+from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.batched import largest
 from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 

@@ -16,8 +16,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ewif_jax.kernels.batched import contiguous, kernel, stage, total
-from ewif_jax.kernels.sparse import Pattern, multiplied, product
+from ewif_jax.fast.batched import contiguous, kernel, stage, total
+from ewif_jax.fast.sparse import Pattern, multiplied, product
 
 
 def matmul(a: Array, b: Array, where: Pattern | None = None) -> Array:

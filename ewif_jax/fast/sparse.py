@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax.kernels.batched import total
+from ewif_jax.fast.batched import total
 
 Pattern = tuple[tuple[bool, ...], ...]
 """Row by row, where a matrix may differ from zero."""

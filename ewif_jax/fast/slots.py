@@ -4,7 +4,7 @@ concatenation would be done one element at a time."""
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax.kernels.batched import kernel, total
+from ewif_jax.fast.batched import kernel, total
 
 
 def pushed(new: Array, table: Array, push: Array) -> Array:

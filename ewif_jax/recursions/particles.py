@@ -13,12 +13,12 @@ from jax import Array, lax
 from jax.scipy.special import logsumexp
 
 from ewif_jax import checks
-from ewif_jax.estimator import verdict
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling, ancestors, effective_sample_size
-from ewif_jax.kernels.small import matmul
 from ewif_jax.models import Model
 from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.recursions.contract import verdict
 from ewif_jax.types import Gaussian, Info, Measurement, Status
 
 

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax.forms.information import InformationState
+from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import symmetric
-from ewif_jax.kernels.small import matmul, matvec
 from ewif_jax.models.model import Model, affine_flow
+from ewif_jax.recursions.information import InformationState
 
 
 class Passage(NamedTuple):

@@ -8,12 +8,12 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.estimator import choose
-from ewif_jax.forms.innovations import numbers
-from ewif_jax.forms.sigma_points import view
+from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, gaussian, symmetric
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model
+from ewif_jax.recursions.innovations import numbers
+from ewif_jax.recursions.sigma_points import view
 from ewif_jax.types import Gaussian, Info, Measurement
 
 

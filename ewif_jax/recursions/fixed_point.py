@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.scipy.linalg import block_diag
 
-from ewif_jax.estimator import choose
-from ewif_jax.forms.covariance import CovarianceState
-from ewif_jax.forms.sigma_points import SigmaPoints, flow_around, measure_around
+from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.kernels.small import matmul, matvec
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around
 from ewif_jax.types import Gaussian, Measurement
 
 

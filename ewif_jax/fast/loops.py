@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax.dependence import Divided, Traced, dependence, divided, traced
-from ewif_jax.groups import (
+from ewif_jax.fast.dependence import Divided, Traced, dependence, divided, traced
+from ewif_jax.fast.groups import (
     Place,
     Portion,
     block_size,
@@ -18,7 +18,7 @@ from ewif_jax.groups import (
     in_groups,
     scan_in_blocks,
 )
-from ewif_jax.layout import (
+from ewif_jax.fast.layout import (
     joined,
     one_run,
     parted,

@@ -1,0 +1,1 @@
+"""What exists only because compilers are slow at small arrays; it knows no filter and no model."""
