@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, flow, patterns
 from ewif_jax.recursions.contract import Recursion, estimator_from
-from ewif_jax.recursions.innovations import Compared, updated
+from ewif_jax.recursions.innovations import compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -69,10 +68,8 @@ def measure(
     (delay 0, status USED or REJECTED). The last `still` components of the state are not the
     model's, which neither moves nor sees them."""
     moving = mean[: mean.shape[0] - still]
-    predicted, H, R = sight(model, params, moving, measurement.sensor, measurement.time)
-    checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    difference = model.residual(measurement.value, predicted, measurement.sensor)
-    seen = Compared(difference, unseen(H, still), R, measurement.mask)
+    seen = compared(model, params, moving, measurement)
+    seen = seen._replace(H=unseen(seen.H, still))
     where = patterns(model)[1]
     if where is not None:
         where = tuple(row + (False,) * still for row in where)
