@@ -10,6 +10,7 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from ewif_jax import checks, scores
+from ewif_jax.recipe import FromRecipe, from_recipe
 from ewif_jax.scores import Score, average, scored
 from ewif_jax.types import Estimator, Measurement
 
@@ -20,11 +21,13 @@ Loss = Callable[..., Array]
 FORWARD_UP_TO = 4
 
 
-class Transform(NamedTuple):
-    """A smooth map from free numbers to a constrained parameter, and its inverse."""
-
+class _Transform(NamedTuple):
     constrain: Callable[[Array], Array]
     free: Callable[[Array], Array]
+
+
+class Transform(FromRecipe, _Transform):
+    """A smooth map from free numbers to a constrained parameter, and its inverse."""
 
 
 class Tuned(NamedTuple):
@@ -36,11 +39,13 @@ class Tuned(NamedTuple):
     history: dict[str, Any]
 
 
+@from_recipe
 def positive() -> Transform:
     """Positive numbers through their logarithm: steps are relative, as suits tau, q and r."""
     return Transform(jnp.exp, jnp.log)
 
 
+@from_recipe
 def psd() -> Transform:
     """Positive definite matrices through their Cholesky factor with a log diagonal."""
 
@@ -55,6 +60,7 @@ def psd() -> Transform:
     return Transform(constrain, free)
 
 
+@from_recipe
 def unconstrained() -> Transform:
     """Any real numbers."""
     return Transform(lambda x: x, lambda x: x)

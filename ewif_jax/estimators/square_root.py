@@ -10,6 +10,7 @@ from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, flow, need_linear, sight
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -22,6 +23,7 @@ class RootState(NamedTuple):
     root: Array
 
 
+@from_recipe
 def square_root(model: Model) -> Estimator:
     r"""The Kalman filter that carries a triangular root of P and never forms P.
 
