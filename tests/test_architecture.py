@@ -27,6 +27,7 @@ RANKS = (
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},
     {"scores", "continuous"},
+    {"losses", "transforms"},
     {"tuning", "monte_carlo"},
     {"scenarios"},
     {"study"},

@@ -13,7 +13,7 @@ import pytest
 
 import ewif_jax as ej
 from ewif_jax.monte_carlo import _simulate
-from ewif_jax.tuning import Transform
+from ewif_jax.transforms import Transform
 
 TRACES = {"F": 0}
 
