@@ -28,6 +28,7 @@ from ewif_jax.fast.layout import (
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
+from ewif_jax.fast.memo import once
 from ewif_jax.streams import float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
@@ -111,7 +112,7 @@ class Content(NamedTuple):
     """What is not a number has been taken out (see `screen`)."""
 
 
-@checks.once
+@once
 def _examined(
     estimator: Estimator,
     params: Any,

@@ -9,7 +9,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
-from ewif_jax.streams import float_dtype
+from ewif_jax.streams import checked_stream, float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
@@ -69,7 +69,7 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    checks.stream(measurements)
+    checked_stream(measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = prior_in(prior, float_dtype(measurements.value))

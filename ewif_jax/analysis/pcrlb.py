@@ -13,7 +13,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, flow, sight
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement
 
 Bound = tuple[Array, Array, Array]
@@ -265,7 +265,7 @@ def _checked(
 ) -> tuple[Measurement, Array, Bound]:
     """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
     truth, after what can be known is checked."""
-    checks.stream(measurements)
+    checked_stream(measurements)
     checks.sensors(measurements, model.sensors)
     steps = jnp.shape(measurements.time)[0]
     checks.shape("truth", truth, ("R", steps, "n"))

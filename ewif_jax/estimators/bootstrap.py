@@ -4,11 +4,13 @@ from typing import Any
 
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def bootstrap(
     model: Model,
     particles: int,

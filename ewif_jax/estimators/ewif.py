@@ -8,12 +8,14 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
+@from_recipe
 def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None = None) -> Estimator:
     r"""The least-squares estimate in which a measurement of age s counts exp(-s / tau).
 

@@ -8,10 +8,12 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def fading(
     model: Model, fading: Any = None, *, inflation: Callable[..., Array] | None = None
 ) -> Estimator:

@@ -8,12 +8,14 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels import symmetric
 from ewif_jax.models.model import Model, affine_flow, need_linear
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def information(model: Model) -> Estimator:
     r"""The Kalman filter on the information matrix, which may start from nothing.
 

@@ -9,6 +9,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
@@ -23,6 +24,7 @@ class WindowState(NamedTuple):
     buffer: Measurement
 
 
+@from_recipe
 def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     r"""The least-squares estimate from the measurements of the last `window` seconds.
 

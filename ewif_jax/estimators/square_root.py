@@ -8,6 +8,7 @@ from jax import Array
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, flow, need_linear
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, unjudged
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
@@ -21,6 +22,7 @@ class RootState(NamedTuple):
     root: Array
 
 
+@from_recipe
 def square_root(model: Model) -> Estimator:
     r"""The Kalman filter that carries a triangular root of P and never forms P.
 

@@ -10,6 +10,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 STRAIGHT = np.zeros((3, 5, 5))
 STRAIGHT[:, :4, :4] = [
@@ -20,6 +21,7 @@ STRAIGHT[:, :4, :4] = [
 TURNING = np.diag([0.0, 0.0, 0.0, 0.0, 1.0])
 
 
+@from_recipe
 def coordinated_turn(
     *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, q_turn: Any = 0.0
 ) -> Model:

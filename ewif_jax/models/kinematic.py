@@ -17,10 +17,12 @@ from ewif_jax.fast.batched import kernel
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.model import Linear, Model, affine_motion, resolve
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 Function = Callable[[Array], Array]
 
 
+@from_recipe
 def random_walk(
     *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, dims: int = 1, b: Any = None
 ) -> Model:
@@ -28,6 +30,7 @@ def random_walk(
     return _kinematic(0, sensors, q, dims, "white", b)
 
 
+@from_recipe
 def constant_velocity(
     *,
     sensors: Sensor | Sequence[Sensor],
@@ -52,6 +55,7 @@ def constant_velocity(
     return _kinematic(1, sensors, q, dims, noise, b)
 
 
+@from_recipe
 def constant_acceleration(
     *,
     sensors: Sensor | Sequence[Sensor],

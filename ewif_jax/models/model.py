@@ -13,6 +13,7 @@ from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.recipe import FromRecipe, from_recipe
 
 
 def resolve(value: Any, params: Any) -> Any:
@@ -41,7 +42,17 @@ class Linear(NamedTuple):
     H_where: Pattern | None = None
 
 
-class Model(NamedTuple):
+class _Model(NamedTuple):
+    transition: Callable[..., Array]
+    process_cov: Callable[..., Array]
+    observe: Callable[..., Array]
+    measurement_cov: Callable[..., Array]
+    residual: Callable[..., Array] = subtract
+    linear: Linear | None = None
+    sensors: int | None = None
+
+
+class Model(FromRecipe, _Model):
     """How a state moves and what the sensors see; pure functions, intervals always explicit.
 
     transition(params, x, t0, t1) -> (n,); t1 < t0 asks for the reversed motion
@@ -53,15 +64,8 @@ class Model(NamedTuple):
     sensors: how many there are, if known
     """
 
-    transition: Callable[..., Array]
-    process_cov: Callable[..., Array]
-    observe: Callable[..., Array]
-    measurement_cov: Callable[..., Array]
-    residual: Callable[..., Array] = subtract
-    linear: Linear | None = None
-    sensors: int | None = None
 
-
+@from_recipe
 def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
     r"""A linear model :math:`x(t_1) = F x(t_0) + b + w,\; z = H x + v`.
 

@@ -15,6 +15,8 @@ from jax.experimental import checkify
 from jax.extend.core import jaxpr_as_fun
 
 from ewif_jax import checks
+from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.recipe import digest
 
 if TYPE_CHECKING:
     from ewif_jax.models.model import Model
@@ -39,27 +41,23 @@ def check_sensor(model: "Model", params: Any, x: Any, sensor: Any, t: Any) -> No
 def _inside(model: "Model", index: int, inputs: tuple) -> bool:
     """Whether the model has what it looks up for this index, asked once: the answer depends on the
     sizes of tables, and on whole numbers that may be indices too."""
-    functions = model.linear, model.observe, model.measurement_cov
+    functions = question_of(model.linear, model.observe, model.measurement_cov)
     leaves, tree = jax.tree.flatten(inputs)
-    asked = (*map(id, functions), index, tree, *map(_size_or_index, leaves))
-    if asked not in _answers:
-        if len(_answers) >= 1000:
-            _answers.clear()
+    # Functions that are gone answer to no question, so they need not be kept.
+    question = _inside, functions, index, tree, *map(_size_or_index, leaves)
+
+    def looks_inside() -> bool:
         examples = jax.tree.map(_example, inputs)
-        inside = not _clamps(model, index, examples) or _clamps(model, 0, examples)
-        _answers[asked] = inside, functions
-    return _answers[asked][0]
+        return not _clamps(model, index, examples) or _clamps(model, 0, examples)
 
-
-_answers: dict[Any, tuple[bool, Any]] = {}
-"""With the functions that were asked, which keeps others from getting their identities."""
+    return remembered(question, looks_inside)
 
 
 def _size_or_index(x: Any) -> Any:
     aval = jax.typeof(x)
     integer = jnp.issubdtype(aval.dtype, jnp.integer) or aval.dtype == bool
     known = checks.known(x) if integer else None
-    return aval if known is None else (aval, known.tobytes())
+    return aval if known is None else (aval, digest(known))
 
 
 def _clamps(model: "Model", index: int, inputs: tuple) -> bool:

@@ -14,6 +14,7 @@ from ewif_jax.kernels import cholesky, gaussian, symmetric, window
 from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.innovations import Compared, sound
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -31,6 +32,7 @@ class WindowState(NamedTuple):
     share: Array | None = None
 
 
+@from_recipe
 def asd(model: Model, lag: int) -> Estimator:
     r"""The filter of the joint density of the states at the last `lag` measurements and now.
 

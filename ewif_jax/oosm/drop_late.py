@@ -3,10 +3,12 @@
 from typing import Any
 
 from ewif_jax import checks
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import offered
 from ewif_jax.types import Estimator, Info, Measurement
 
 
+@from_recipe
 def drop_late(estimator: Estimator) -> Estimator:
     """The estimator that uses a measurement only if it is not older than the state.
 

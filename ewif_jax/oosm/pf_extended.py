@@ -12,6 +12,7 @@ from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, flow
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -30,6 +31,7 @@ class PathState(NamedTuple):
     past: Array
 
 
+@from_recipe
 def pf_extended(
     model: Model,
     particles: int,

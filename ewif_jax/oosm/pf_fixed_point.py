@@ -13,6 +13,7 @@ from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, sight
 from ewif_jax.oosm.history import last_before
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.fixed_point import Conditional, fixed_point, given
@@ -38,6 +39,7 @@ class SummaryState(NamedTuple):
     measured: Measurement
 
 
+@from_recipe
 def pf_fixed_point(
     model: Model,
     particles: int,

@@ -8,11 +8,13 @@ from jax import Array, lax
 
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions.particles import ParticleState, Seen
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def pf_retrodict(
     model: Model,
     particles: int,

@@ -11,6 +11,7 @@ from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, flow, patterns, sight
 from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Info, Measurement
@@ -26,6 +27,7 @@ class Tie(NamedTuple):
     cov: Array
 
 
+@from_recipe
 def rts_reference(model: Model, lag: int) -> Estimator:
     r"""The Kalman filter that smooths back to a late measurement's time, one stored time after
     the other.

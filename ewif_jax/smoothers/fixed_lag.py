@@ -12,6 +12,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model, flow, resolve, sight
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
@@ -27,6 +28,7 @@ class LagState(NamedTuple):
     cov: Array
 
 
+@from_recipe
 def fixed_lag(model: Model, lag: int) -> Estimator:
     r"""The Kalman estimate of the state `lag` measurement times ago.
 
@@ -121,6 +123,7 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
     return Estimator(init, predict, update, estimate)
 
 
+@from_recipe
 def fixed_lag_ewif(
     model: Model, tau: Any = None, *, lag: Any, weight: Callable[..., Array] | None = None
 ) -> Estimator:
