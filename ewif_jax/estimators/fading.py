@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model, resolve
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 

@@ -7,7 +7,8 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import symmetric
-from ewif_jax.models.model import Model, affine_flow, need_linear
+from ewif_jax.models.linearise import affine_flow, need_linear
+from ewif_jax.models.model import Model
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState

@@ -8,7 +8,8 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model, resolve
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState

@@ -9,7 +9,8 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.model import Model, flow, need_linear, sight
+from ewif_jax.models.linearise import need_linear, predict_measurement, predict_state
+from ewif_jax.models.model import Model
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -52,7 +53,7 @@ def square_root(model: Model) -> Estimator:
     def predict(params: Any, state: RootState, time: Array) -> RootState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, ahead)
         root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
         known = time >= state.time
         return RootState(time, jnp.where(known, mean, jnp.nan), jnp.where(known, root, jnp.nan))
@@ -61,7 +62,9 @@ def square_root(model: Model) -> Estimator:
         mask = measurement.mask
         late = measurement.time < state.time
         present = jnp.any(mask)
-        predicted, H, R = sight(model, params, state.mean, measurement.sensor, measurement.time)
+        predicted, H, R = predict_measurement(
+            model, params, state.mean, measurement.sensor, measurement.time
+        )
         m, n = H.shape
         checks.shape("measurement.value", measurement.value, (m,))
         difference = model.residual(measurement.value, predicted, measurement.sensor)

@@ -5,14 +5,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matvec
-from ewif_jax.fast.sparse import Pattern, pattern
-from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.fast.sparse import Pattern
+from ewif_jax.models.discrete import constant_input, one_step, over_one_interval, pattern_of_powers
+from ewif_jax.models.tables import by_sensor, count_sensors, pattern_of_table
 
 
 def resolve(value: Any, params: Any) -> Any:
@@ -84,16 +83,16 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
             speak of different numbers of sensors.
     """
     given = F, H
-    F, n = _one_step(F)
+    F, n = one_step(F)
     if not callable(Q) and Q is not None:
         checks.psd("Q", Q)
         checks.shape("Q", Q, ("n" if n is None else n,) * 2)
-        Q = _over_one_interval(jnp.asarray(Q))
+        Q = over_one_interval(jnp.asarray(Q))
     if b is not None:
-        b = _input(b, n)
-    H, rows = _by_sensor("H", H)
-    R, cols = _by_sensor("R", R)
-    sensors = _count_sensors(rows, cols)
+        b = constant_input(b, n)
+    H, rows = by_sensor("H", H)
+    R, cols = by_sensor("R", R)
+    sensors = count_sensors(rows, cols)
 
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
         if Q is None:
@@ -108,7 +107,7 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
         return jnp.asarray(R(params, sensor, t))
 
     transition = affine_motion(F, b)
-    linear = Linear(F, b, H, _pattern_of_powers(given[0]), _pattern_of_table(given[1]))
+    linear = Linear(F, b, H, pattern_of_powers(given[0]), pattern_of_table(given[1]))
     return Model(transition, process_cov, observe, measurement_cov, subtract, linear, sensors)
 
 
@@ -116,98 +115,14 @@ def affine_motion(F: Any, b: Any) -> Callable[..., Array]:
     """The transition (params, x, t0, t1) -> (n,) of x(t1) = F x(t0) + b, in either direction."""
 
     def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
-        matrix, offset = _affine(F, b, params, t0, t1, x.dtype)
+        matrix, offset = affine(F, b, params, t0, t1, x.dtype)
         moved = matvec(matrix, x)
         return moved if offset is None else moved + offset
 
     return transition
 
 
-def affine_flow(
-    model: Model, params: Any, t0: Array, t1: Array, dtype: Any
-) -> tuple[Array, Array | None]:
-    """F (n, n) and c (n,) or None of a linear model: x(t1) = F x(t0) + c, in either direction.
-
-    Against time c is derived from the forward input: c(t1, t0) = -F(t1, t0) b(t0, t1).
-    """
-    linear = need_linear(model, "this operation")
-    return _affine(linear.F, linear.b, params, t0, t1, dtype)
-
-
-def flow(model: Model, params: Any, x: Array, t0: Array, t1: Array) -> tuple[Array, Array, Array]:
-    """x at t1 (n,), the Jacobian F (n, n) of the motion at x, and Q (n, n) for t1 >= t0."""
-    Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
-    if model.linear is not None:
-        F, c = affine_flow(model, params, t0, t1, x.dtype)
-        checks.shape("F", F, (x.shape[0],) * 2)
-        moved = matvec(F, x, model.linear.F_where)
-        return (moved if c is None else moved + c), F, Q
-
-    def move(x: Array) -> Array:
-        return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
-
-    F = jax.jacfwd(move)(x)
-    checks.shape("F", F, (x.shape[0],) * 2)
-    return move(x), F, Q
-
-
-def sight(
-    model: Model, params: Any, x: Array, sensor: Array, t: Array
-) -> tuple[Array, Array, Array]:
-    """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
-    check_sensor(model, params, x, sensor, t)
-    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
-    if model.linear is not None:
-        H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
-        checks.shape("H", H, ("m", x.shape[0]))
-        checks.shape("R", R, (H.shape[0],) * 2)
-        return matvec(H, x, model.linear.H_where), H, R
-
-    def see(x: Array) -> Array:
-        return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
-
-    H = jax.jacfwd(see)(x)
-    checks.shape("R", R, (H.shape[0],) * 2)
-    return see(x), H, R
-
-
-def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:
-    """Where F and H of a model may differ from zero, if that is known."""
-    return (None, None) if model.linear is None else (model.linear.F_where, model.linear.H_where)
-
-
-def observation(
-    model: Model, params: Any, sensor: Array, t: Array, dtype: Any
-) -> tuple[Array, Array]:
-    """H (m, n) and R (m, m) of a linear model."""
-    linear = need_linear(model, "this operation")
-    check_sensor(model, params, None, sensor, t)
-    H = jnp.asarray(linear.H(params, sensor, t), dtype)
-    return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
-
-
-def size(model: Model, params: Any, t0: Any) -> int:
-    """n, read off a linear model without computing anything."""
-    linear = need_linear(model, "prior=None")
-    return jax.eval_shape(lambda: jnp.asarray(linear.F(params, t0, t0))).shape[0]
-
-
-def need_linear(model: Model, method: str) -> Linear:
-    """The matrices of `model`, or an error that says which method wanted them."""
-    checks.require(
-        isinstance(model, Model), "model", "a Model (linear_model(...), models.*)", type(model)
-    )
-    checks.require(
-        model.linear is not None,
-        "model",
-        f"a linear model: {method} needs F and H (use `extended` for a nonlinear one)",
-        "a Model without matrices",
-    )
-    assert model.linear is not None
-    return model.linear
-
-
-def _affine(
+def affine(
     F: Any, b: Any, params: Any, t0: Array, t1: Array, dtype: Any
 ) -> tuple[Array, Array | None]:
     matrix = jnp.asarray(F(params, t0, t1), dtype)
@@ -215,82 +130,3 @@ def _affine(
         return matrix, None
     ahead = jnp.asarray(b(params, jnp.minimum(t0, t1), jnp.maximum(t0, t1)), dtype)
     return matrix, jnp.where(t1 >= t0, ahead, -matvec(matrix, ahead))
-
-
-def _input(b: Any, n: int | None) -> Any:
-    if callable(b):
-        return b
-    checks.shape("b", b, ("n" if n is None else n,))
-    return _over_one_interval(jnp.asarray(b))
-
-
-def _one_step(F: Any) -> tuple[Any, int | None]:
-    """F as a function of (params, t0, t1), and its size if it is constant."""
-    if callable(F):
-        return F, None
-    checks.shape("F", F, ("n", "n"))
-    checks.require(np.shape(F)[0] == np.shape(F)[1], "F", "a square matrix", np.shape(F))
-    checks.finite("F", F)
-    ahead = array(F)
-    n = ahead.shape[0]
-    known = np.asarray(F)
-    invertible = np.linalg.matrix_rank(known) == n
-    back = jnp.asarray(np.linalg.inv(known) if invertible else np.full((n, n), np.nan), ahead.dtype)
-
-    def matrix(params: Any, t0: Array, t1: Array) -> Array:
-        del params
-        still = jnp.eye(n, dtype=ahead.dtype)
-        return jnp.where(t1 > t0, ahead, jnp.where(t1 < t0, back, still))
-
-    return matrix, n
-
-
-def _pattern_of_powers(F: Any) -> Pattern | None:
-    """Where any power of a constant F, and so its inverse, may differ from zero."""
-    if callable(F):
-        return None
-    n = np.shape(F)[0]
-    return pattern(np.linalg.matrix_power((np.asarray(F) != 0) + np.eye(n), n))
-
-
-def _pattern_of_table(H: Any) -> Pattern | None:
-    """Where a constant matrix, or any of a table, may differ from zero."""
-    known = None if callable(H) else checks.known(H)
-    return None if known is None else pattern(*known.reshape(-1, *known.shape[-2:]))
-
-
-def _over_one_interval(value: Array) -> Any:
-    return lambda params, t0, t1: jnp.where(t0 == t1, 0, value)
-
-
-def _by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
-    """A function of (params, sensor, t), and how many sensors it knows of: S of a table, 0 for a
-    matrix that all sensors share, None for a function."""
-    if callable(x):
-        return x, None
-    table = array(x)
-    checks.finite(argument, x)
-    checks.require(
-        table.ndim in (2, 3), argument, "a function, a matrix or a table (S, ., .)", table.shape
-    )
-    if argument == "R":
-        for k, matrix in enumerate(np.asarray(x) if table.ndim == 3 else [x]):
-            checks.psd("R" if table.ndim == 2 else f"R[{k}]", matrix)
-    if table.ndim == 2:
-        return (lambda params, sensor, t: table), 0
-    return (lambda params, sensor, t: select(table, sensor)), table.shape[0]
-
-
-def _count_sensors(rows: int | None, cols: int | None) -> int | None:
-    """How many sensors H and R speak of together; one matrix each is one sensor."""
-    tables = [count for count in (rows, cols) if count]
-    checks.require(
-        len(set(tables)) < 2, "R", f"as many sensors as H has ({rows})", f"{cols} sensors"
-    )
-    return tables[0] if tables else 1 if rows == cols == 0 else None
-
-
-def select(table: Array, index: Array) -> Array:
-    """table[index] for a small table, as a product (a gather is slow in a batch)."""
-    chosen = (jnp.arange(table.shape[0]) == index).astype(table.dtype)
-    return matvec(table.reshape(table.shape[0], -1).T, chosen).reshape(table.shape[1:])

@@ -10,7 +10,8 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.sparse import Pattern, pattern
-from ewif_jax.models.model import resolve, select
+from ewif_jax.models.model import resolve
+from ewif_jax.models.tables import select
 
 
 class Sensor(NamedTuple):

@@ -11,7 +11,7 @@ from ewif_jax.fast import slots
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.covariance import CovarianceState, covariance_form
 from ewif_jax.recursions.innovations import Compared, updated
@@ -100,15 +100,15 @@ def late_update(
     """Mean and packed covariance of now after a measurement of a time between `start` and now."""
     dtype = state.mean.dtype
     at = jnp.clip(measurement.time, start.time, state.time)
-    predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
+    predicted, F, Q_all = predict_state(model, params, start.mean, start.time, state.time)
     F_where, H_where = patterns(model)
     M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
     moved, origin = state.mean - predicted, state.mean
     if noise_estimated and model.linear is None:
         origin = origin - matvec(Q, cholesky.solved(symmetric.unpack(M), moved))
-    there, back, _ = flow(model, params, origin, state.time, at)
-    value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+    there, back, _ = predict_state(model, params, origin, state.time, at)
+    value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     seen = matmul(H, back, H_where)
     noisy = matmul(seen, Q)

@@ -10,7 +10,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -49,7 +49,7 @@ def covariance_form(
     def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, ahead)
         known = time >= state.time
         if inflation is None:
             cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
@@ -86,7 +86,9 @@ def measure(
     (delay 0, status USED or REJECTED). The last `still` components of the state are not the
     model's, which neither moves nor sees them."""
     moving = mean[: mean.shape[0] - still]
-    predicted, H, R = sight(model, params, moving, measurement.sensor, measurement.time)
+    predicted, H, R = predict_measurement(
+        model, params, moving, measurement.sensor, measurement.time
+    )
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     difference = model.residual(measurement.value, predicted, measurement.sensor)
     seen = Compared(difference, unseen(H, still), R, measurement.mask)

@@ -11,7 +11,8 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.model import Model, affine_flow, need_linear, observation
+from ewif_jax.models.linearise import affine_flow, need_linear, observation
+from ewif_jax.models.model import Model
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 

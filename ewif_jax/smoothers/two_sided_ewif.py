@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model, resolve
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import joined
