@@ -33,6 +33,7 @@ def one_step(F: Any) -> tuple[Any, int | None]:
 
 
 def constant_input(b: Any, n: int | None) -> Any:
+    """The known input as a function of (params, t0, t1)."""
     if callable(b):
         return b
     checks.shape("b", b, ("n" if n is None else n,))
@@ -40,6 +41,7 @@ def constant_input(b: Any, n: int | None) -> Any:
 
 
 def over_one_interval(value: Array) -> Any:
+    """`value` over an interval, zero over none."""
     return lambda params, t0, t1: jnp.where(t0 == t1, 0, value)
 
 

@@ -125,6 +125,7 @@ def affine_motion(F: Any, b: Any) -> Callable[..., Array]:
 def affine(
     F: Any, b: Any, params: Any, t0: Array, t1: Array, dtype: Any
 ) -> tuple[Array, Array | None]:
+    """F (n, n) and c (n,) or None of x(t1) = F x(t0) + c, in either direction."""
     matrix = jnp.asarray(F(params, t0, t1), dtype)
     if b is None:
         return matrix, None
