@@ -9,6 +9,7 @@ import numpy as np
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.fast.compiling import array
+from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -35,6 +36,7 @@ def validated(
     checks.resolvable(measurements.time, dtype)
     if times is not None:
         checks.report_times(times, np.shape(measurements.time)[0])
+    check_times(estimator.model, measurements, t0, dtype, times)
     sensors = checks.known(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
@@ -55,6 +57,8 @@ def validated(
     if trial not in _tried:
         if len(_tried) >= 1000:
             _tried.clear()
+        model, stamps = estimator.model, measurements.time
+        check_covariances_of(model, params, t0, stamps, measurements.sensor)
         _tried[trial] = jax.eval_shape(first)
     return _tried[trial]
 

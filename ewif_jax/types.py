@@ -63,6 +63,14 @@ class Info(NamedTuple):
     status: Array
 
 
+class Steps(NamedTuple):
+    """How the time of a discrete-time model is counted: in whole steps of `dt` seconds, at most
+    `max_steps` of them at once."""
+
+    dt: float
+    max_steps: int
+
+
 class Estimator(NamedTuple):
     """Four pure functions; every filter of the package, in sequence or not, is one.
 
@@ -71,13 +79,16 @@ class Estimator(NamedTuple):
     update(params, state, measurement) -> (state, Info); accepts measurement.time <= state.time
     estimate(params, state) -> Gaussian
 
-    A state is a pytree with a field `time` and holds only what the next step needs.
+    A state is a pytree with a field `time` and holds only what the next step needs. `model`, if
+    given, says what can be asked of the filter: a model in discrete time has no state between two
+    of its steps.
     """
 
     init: Callable[..., Any]
     predict: Callable[..., Any]
     update: Callable[..., tuple[Any, Info]]
     estimate: Callable[..., Gaussian]
+    model: Any = None
 
 
 class Trace(NamedTuple):

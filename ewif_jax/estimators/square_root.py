@@ -95,4 +95,4 @@ def square_root(model: Model) -> Estimator:
         del params
         return Gaussian(state.mean, state.root @ state.root.T)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model)

@@ -14,7 +14,8 @@ from ewif_jax.models.linearise import (
     predict_state,
     size,
 )
-from ewif_jax.models.model import Linear, Model, linear_model, resolve
+from ewif_jax.models.model import Linear, Model, linear_model
+from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bearing_sensor, position_sensor, wrap_angle
 
 __all__ = [

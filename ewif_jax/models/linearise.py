@@ -98,3 +98,14 @@ def need_linear(model: Model, method: str) -> Linear:
     )
     assert model.linear is not None
     return model.linear
+
+
+def need_reversible(model: Model, method: str) -> Model:
+    """`model`, unless it is known that its motion cannot be followed back."""
+    checks.require(
+        model.linear is None or model.linear.reversible,
+        "model",
+        f"a model whose F has an inverse: {method} asks where a state came from",
+        "a singular F",
+    )
+    return model

@@ -5,18 +5,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern
-from ewif_jax.models.discrete import constant_input, one_step, over_one_interval, pattern_of_powers
+from ewif_jax.models import domain
+from ewif_jax.models.discrete import constant, is_discrete, motion, pattern_of_powers
+from ewif_jax.models.parameters import named, resolve
 from ewif_jax.models.tables import by_sensor, count_sensors, pattern_of_table
+from ewif_jax.types import Steps
 
-
-def resolve(value: Any, params: Any) -> Any:
-    """`value(params)` if it is a function of the parameters, else `value`."""
-    return value(params) if callable(value) else value
+__all__ = ["Linear", "Model", "affine", "affine_motion", "linear_model", "resolve", "subtract"]
 
 
 def subtract(value: Array, predicted: Array, sensor: Array) -> Array:
@@ -30,7 +31,7 @@ class Linear(NamedTuple):
 
     F(params, t0, t1) -> (n, n); b(params, t0, t1) -> (n,) or None; H(params, sensor, t) -> (m, n).
     F_where and H_where: where F (in either direction) and H may differ from zero, if that is known;
-    what is zero is not computed.
+    what is zero is not computed. reversible: False where F is known to have no inverse.
     """
 
     F: Callable[..., Array]
@@ -38,6 +39,7 @@ class Linear(NamedTuple):
     H: Callable[..., Array]
     F_where: Pattern | None = None
     H_where: Pattern | None = None
+    reversible: bool = True
 
 
 class Model(NamedTuple):
@@ -50,6 +52,9 @@ class Model(NamedTuple):
     residual(value, predicted, sensor) -> (m,); wraps angles
     linear: the matrices if the model is linear
     sensors: how many there are, if known
+    steps: how time is counted if the model is discrete (what is between two steps is NaN)
+    check: check(params, t0, t1, sensors) refuses known parameters that make no covariances; None:
+        process_cov and measurement_cov are looked at
     """
 
     transition: Callable[..., Array]
@@ -59,56 +64,103 @@ class Model(NamedTuple):
     residual: Callable[..., Array] = subtract
     linear: Linear | None = None
     sensors: int | None = None
+    steps: Steps | None = None
+    check: Callable[..., None] | None = None
 
 
-def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
+def linear_model(
+    F: Any,
+    H: Any,
+    R: Any,
+    Q: Any = None,
+    b: Any = None,
+    *,
+    dt: float = 1.0,
+    max_steps: int = 1023,
+) -> Model:
     r"""A linear model :math:`x(t_1) = F x(t_0) + b + w,\; z = H x + v`.
+
+    An F that is an array, or a function of `params` alone, makes a model in discrete time: it
+    speaks of one step of `dt` seconds. Over k steps
+
+    .. math::
+        F_k = F^k, \quad b_k = \sum_{i<k} F^i b, \quad Q_k = \sum_{i<k} F^i Q F^{i\prime},
+
+    over none nothing happens, and against time F is inverted. Rows may be missing, late, or far
+    apart, as long as every time is whole steps away from t0 (to 0.01 dt, or what the times' dtype
+    can tell apart). A time between two steps is refused where it is known; else what arrives then
+    is `REJECTED` and the filter stays where it is. An identity F given as an array, with neither
+    Q nor b of one step, stands still over any interval.
 
     Args:
         F: function (params, t0, t1) -> (n, n), also for t1 < t0 where late data or smoothing need
-            it; or a constant (n, n), the transition over one interval *whatever its length*.
-        H: function (params, sensor, t) -> (m, n); or a constant (m, n); or a table (S, m, n).
-        R: covariance of v, likewise: function, (m, m) or (S, m, m).
-        Q: covariance of w, function (params, t0, t1) -> (n, n) for t1 >= t0, or a constant (n, n)
-            for one interval, or None (no process noise).
-        b: known input, function (params, t0, t1) -> (n,) for t1 >= t0, or a constant (n,) for one
-            interval, or None.
+            it; or for one step: (n, n), or a function of `params` alone.
+        H: function (params, sensor, t) -> (m, n); (m, n); a table (S, m, n); or a function of
+            `params` alone that gives one of these.
+        R: covariance of v, likewise: function, (m, m), (S, m, m), or function of `params` alone.
+        Q: covariance of w, function (params, t0, t1) -> (n, n) for t1 >= t0; for one step (n, n) or
+            a function of `params` alone; or None (no process noise).
+        b: known input, function (params, t0, t1) -> (n,) for t1 >= t0; for one step (n,) or a
+            function of `params` alone; or None.
+        dt: seconds of one step, a number > 0.
+        max_steps: how many steps may be asked for at once.
 
-    Constants F, Q and b speak of one step of equally spaced data: over an empty interval F is the
-    identity and Q and b are zero; against time F is inverted. For stamps of any other kind give
-    functions of (t0, t1), or use `ewif_jax.models`.
+    A function of (params, t0, t1) speaks of its whole interval, beside a discrete F too. The
+    derivatives of a discrete model with respect to times are 0. In a batch whose times differ by
+    run every interval costs what the longest might: shared times are faster.
 
     Raises:
         ValueError: a constant has the wrong shape, or a constant Q or R is not PSD; tables H and R
-            speak of different numbers of sensors.
+            speak of different numbers of sensors; Q or b of one step beside an F that is a function
+            of (params, t0, t1).
     """
-    given = F, H
-    F, n = one_step(F)
+    checks.require(checks.known(dt) is not None, "dt", "a number, not a parameter", "a tracer")
+    checks.positive("dt", dt)
+    steps = Steps(float(dt), checks.whole("max_steps", max_steps, 1))
+    F = constant("F", F, ("n", "n")) if is_discrete(F) else named(F)
+    n: int | str = "n"
+    if isinstance(F, np.ndarray):
+        checks.require(F.shape[0] == F.shape[1], "F", "a square matrix", F.shape)
+        n = F.shape[0]
     if not callable(Q) and Q is not None:
         checks.psd("Q", Q)
-        checks.shape("Q", Q, ("n" if n is None else n,) * 2)
-        Q = over_one_interval(jnp.asarray(Q))
-    if b is not None:
-        b = constant_input(b, n)
+    Q = constant("Q", Q, (n, n)) if is_discrete(Q) else named(Q)
+    b = constant("b", b, (n,)) if is_discrete(b) else named(b)
+    F_where, H_where = pattern_of_powers(F), pattern_of_table(H)
+    R_varies = callable(R)
     H, rows = by_sensor("H", H)
     R, cols = by_sensor("R", R)
     sensors = count_sensors(rows, cols)
+    moved = motion(F, Q, b, steps)
 
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
-        if Q is None:
-            size = jax.eval_shape(lambda: jnp.asarray(F(params, t0, t1))).shape[0]
+        if moved.Q is None:
+            size = jax.eval_shape(lambda: jnp.asarray(moved.F(params, t0, t1))).shape[0]
             return jnp.zeros((size, size))
-        return jnp.asarray(Q(params, t0, t1))
+        found = jnp.asarray(moved.Q(params, t0, t1))
+        return domain.covariance("Q", found) if callable(Q) else found
 
     def observe(params: Any, x: Array, sensor: Array, t: Array) -> Array:
         return matvec(jnp.asarray(H(params, sensor, t), x.dtype), x)
 
     def measurement_cov(params: Any, sensor: Array, t: Array) -> Array:
-        return jnp.asarray(R(params, sensor, t))
+        found = jnp.asarray(R(params, sensor, t))
+        return domain.covariance("R", found) if R_varies else found
 
-    transition = affine_motion(F, b)
-    linear = Linear(F, b, H, pattern_of_powers(given[0]), pattern_of_table(given[1]))
-    return Model(transition, process_cov, observe, measurement_cov, subtract, linear, sensors)
+    linear = Linear(moved.F, moved.b, H, F_where, H_where, moved.reversible)
+    check = domain.check_covariances(
+        process_cov if callable(Q) else None, measurement_cov if R_varies else None
+    )
+    return Model(
+        affine_motion(moved.F, moved.b),
+        process_cov,
+        observe,
+        measurement_cov,
+        linear=linear,
+        sensors=sensors,
+        steps=moved.steps,
+        check=check,
+    )
 
 
 def affine_motion(F: Any, b: Any) -> Callable[..., Array]:

@@ -157,7 +157,7 @@ def asd(model: Model, lag: int) -> Estimator:
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model)
 
 
 def _split(

@@ -12,6 +12,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, patterns, predict_measurement, predict_state
+from ewif_jax.models.linearise import need_reversible
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.covariance import CovarianceState, covariance_form
 from ewif_jax.recursions.innovations import Compared, updated
@@ -51,6 +52,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
     Times without a used measurement are not stored. The prior at t0 is the first entry.
     """
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
+    need_reversible(model, method)
     lag = checks.whole("lag", lag, 1)
     form = covariance_form(model, method)
 
@@ -78,7 +80,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model)
 
 
 def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceState]:

@@ -111,7 +111,7 @@ def pf_extended(
         used = state.used | form.was_used(info)
         return state._replace(log_weights=log_weights, key=key, used=used), info
 
-    return Estimator(init, predict, update, form.estimate)
+    return Estimator(init, predict, update, form.estimate, model)
 
 
 def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:

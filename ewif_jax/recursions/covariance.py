@@ -76,7 +76,7 @@ def covariance_form(
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model)
 
 
 def measure(

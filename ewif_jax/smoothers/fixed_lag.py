@@ -121,7 +121,7 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         n = state.mean.shape[1]
         return Gaussian(state.mean[-1], state.cov[-n:, -n:])
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model)
 
 
 def fixed_lag_ewif(
