@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -37,6 +38,7 @@ def validated(
     checks.resolvable(measurements.time, dtype)
     if times is not None:
         checks.report_times(times, np.shape(measurements.time)[0])
+    check_times(estimator.model, measurements, t0, dtype, times)
     sensors = checks.known(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
@@ -59,7 +61,13 @@ def validated(
     if all(value is not None for value in values):
         asked = question_of(estimator, shapes, setting, values)
     question = None if asked is None else (validated, structure, asked)
-    return remembered(question, lambda: jax.eval_shape(first))
+
+    def tried() -> Any:
+        model, stamps = estimator.model, measurements.time
+        check_covariances_of(model, params, t0, stamps, measurements.sensor)
+        return jax.eval_shape(first)
+
+    return remembered(question, tried)
 
 
 def _indexable(x: Any) -> Any:

@@ -65,6 +65,14 @@ class Info(NamedTuple):
     status: Array
 
 
+class Steps(NamedTuple):
+    """How the time of a discrete-time model is counted: in whole steps of `dt` seconds, at most
+    `max_steps` of them at once."""
+
+    dt: float
+    max_steps: int
+
+
 class Init(Protocol):
     """The first state: of the prior at time t0; the PRNG key is for a filter that draws noise.
 
@@ -103,6 +111,7 @@ class _Estimator(NamedTuple):
     update: Update
     estimate: Estimate
     series: Callable[..., Any] | None = None
+    model: Any = None
 
 
 class Estimator(FromRecipe, _Estimator):
@@ -113,6 +122,9 @@ class Estimator(FromRecipe, _Estimator):
     update(params, state, measurement) -> (state, Info); accepts measurement.time <= state.time
     estimate(params, state) -> Gaussian
     series: how a whole series is filtered faster with the same result, if there is a way
+
+    model: what the filter is a filter of, if one Model says it: a model in discrete time has no
+        state between two of its steps
 
     A state is a pytree with a field `time` and holds only what the next step needs. A wrapper that
     changes one of the four builds a new `Estimator`, and so leaves `series` behind.

@@ -164,7 +164,7 @@ def test_the_memo_keeps_neither_parameters_nor_functions(entry):
         ej.run_batch(ej.kalman(model), params, batch, **setting)
     else:
         looked_up = STREAM._replace(sensor=jnp.ones(3, jnp.int32))
-        model = ej.linear_model(np.eye(1), lambda p, s, t: H(p, s, t)[None][s], np.eye(1))
+        model = ej.linear_model(np.eye(1), lambda p, s, t: H(p, s, t)[None][s], np.eye(1))  # noqa: F821
         with pytest.raises(ValueError, match=r"measurement\.sensor"):
             ej.run(ej.kalman(model), params, looked_up, **setting)
     assert len(memo.ANSWERS) > before

@@ -94,4 +94,4 @@ def ensemble(
         del params
         return ensembles.moments(state.members)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)

@@ -1,6 +1,7 @@
 """The Kalman filter in covariance form."""
 
-from ewif_jax.models.model import Model, need_linear
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator

@@ -7,7 +7,8 @@ from jax import Array
 
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.model import Model, flow, need_linear
+from ewif_jax.models.linearise import need_linear, predict_state
+from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, unjudged
@@ -47,7 +48,7 @@ def square_root(model: Model) -> Estimator:
         return RootState(t0, prior.mean, cholesky.factor(prior.cov).lower)
 
     def move(params: Any, state: RootState, time: Array) -> RootState:
-        mean, F, Q = flow(model, params, state.mean, state.time, time)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
         return RootState(time, mean, root)
 
@@ -74,7 +75,5 @@ def square_root(model: Model) -> Estimator:
         del params
         return Gaussian(state.mean, state.root @ state.root.T)
 
-    estimated = ("mean", "root")
-    return estimator_from(
-        Recursion("square_root", start, move, measure, estimate, estimated=estimated)
-    )
+    recursion = Recursion("square_root", start, move, measure, estimate, model=model)
+    return estimator_from(recursion._replace(estimated=("mean", "root")))

@@ -10,7 +10,9 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.sparse import Pattern, pattern
-from ewif_jax.models.model import resolve, select
+from ewif_jax.models import domain
+from ewif_jax.models.parameters import resolve
+from ewif_jax.models.tables import select
 from ewif_jax.recipe import FromRecipe, from_recipe
 
 
@@ -75,12 +77,15 @@ def _covariance(r: Any, m: int) -> Callable[..., Array]:
             checks.psd("r", r)
             checks.shape("r", r, (m, m))
         else:
-            checks.shape("r", r, ())
-            checks.at_least("r", r, 0.0)
+            domain.check_variance("r", r)
 
     def cov(params: Any, t: Array) -> Array:
-        value = jnp.asarray(resolve(r, params))
-        return value if value.ndim == 2 else value * jnp.eye(m, dtype=value.dtype)
+        value = resolve(r, params)
+        if np.ndim(value) == 2:
+            checks.shape("r", value, (m, m))
+            return jnp.asarray(domain.covariance("r", value))
+        value = domain.floating(domain.variance("r", value, params))
+        return value * jnp.eye(m, dtype=value.dtype)
 
     return cov
 

@@ -118,7 +118,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     def estimate(params: Any, state: ReplayState) -> Gaussian:
         return estimator.estimate(params, state.current)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=estimator.model)
 
 
 def _padded(measurement: Measurement, width: int) -> Measurement:

@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns
+from ewif_jax.models import Model, patterns, predict_state
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
@@ -42,7 +42,7 @@ def covariance_form(
         return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
     def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
-        mean, F, Q = flow(model, params, state.mean, state.time, time)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         cov = symmetric.congruence(F, state.cov, patterns(model)[0])
         if inflation is not None:
             cov = _inflated(cov, inflation(params, state.time, time))
@@ -58,7 +58,9 @@ def covariance_form(
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return estimator_from(Recursion(method, start, move, measure_now, estimate, keeps=True))
+    return estimator_from(
+        Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)
+    )
 
 
 def measure(

@@ -9,7 +9,7 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import Pattern
 from ewif_jax.kernels import gaussian, symmetric
-from ewif_jax.models import Model, sight
+from ewif_jax.models import Model, predict_measurement
 from ewif_jax.types import Info, Measurement, Status
 
 
@@ -25,7 +25,7 @@ class Compared(NamedTuple):
 
 def compared(model: Model, params: Any, mean: Array, measurement: Measurement) -> Compared:
     """A measurement at its time as it is seen from `mean` (n,) there."""
-    predicted, H, R = sight(model, params, mean, measurement.sensor, measurement.time)
+    predicted, H, R = predict_measurement(model, params, mean, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     difference = model.residual(measurement.value, predicted, measurement.sensor)
     return Compared(difference, H, R, measurement.mask)
