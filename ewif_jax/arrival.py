@@ -8,7 +8,6 @@ from jax import Array
 
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.steps import whole_steps
-from ewif_jax.clocks import slack
 from ewif_jax.streams import cast, in_dtype
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -101,7 +100,8 @@ def _place(
         now = jnp.where(in_step, now, start)
         refused = ~in_step | ~whole_steps(steps, now, stamp)
     if by_clock:
-        ahead = stamp > now + slack(jnp, stamp, now)
+        rounding = 4 * jnp.finfo(stamp.dtype).eps * jnp.maximum(jnp.abs(stamp), jnp.abs(now))
+        ahead = stamp > now + rounding
         refused = ahead if refused is None else refused | ahead
     return now, refused
 

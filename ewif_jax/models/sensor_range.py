@@ -16,9 +16,8 @@ from jax.extend.core import jaxpr_as_fun
 
 from ewif_jax import checks
 from ewif_jax.fast.memo import question_of, remembered
-from ewif_jax.recipe import digest
-
 from ewif_jax.models.model import Model
+from ewif_jax.recipe import digest
 
 
 def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None:
