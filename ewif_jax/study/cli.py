@@ -8,8 +8,8 @@ from importlib.util import find_spec
 import jax
 
 from ewif_jax.fast.compiling import prepare_cpu
-from ewif_jax.study.arguments import parser
-from ewif_jax.study.registry import STUDIES
+from ewif_jax.study.shared.arguments import parser
+from ewif_jax.study.shared.registry import STUDIES
 
 EXTRA = ("h5netcdf", "h5py", "matplotlib", "pandas", "pyproj", "rich", "xarray")
 
@@ -26,7 +26,7 @@ def run(argv: Sequence[str]) -> int:
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         return _complain(f'needs {", ".join(missing)}: pip install "ewif_jax[study]"', 1)
-    from ewif_jax.study.experiment import Experiment, Options, Refused
+    from ewif_jax.study.shared.experiment import Experiment, Options, Refused
 
     options = Options(
         runs=arguments.runs,
@@ -40,7 +40,7 @@ def run(argv: Sequence[str]) -> int:
     try:
         with jax.enable_x64(arguments.dtype == "float64"):
             if arguments.action == "track":
-                from ewif_jax.study.track import track
+                from ewif_jax.study.track.command import track
 
                 track(arguments, options)
             else:
