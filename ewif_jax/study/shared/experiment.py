@@ -1,6 +1,7 @@
 """What a study is given: its options, the screen, and a place for what it finds."""
 
 import datetime
+import io
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -8,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import h5netcdf
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,12 +21,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from ewif_jax.study.shared.folder import Arrays, Folder
+from ewif_jax.study.shared.folder import Folder
+from ewif_jax.study.shared.pieces import Arrays
+from ewif_jax.study.shared.refusal import Refused, stop_if_asked
 from ewif_jax.study.shared.timing import timed
 
-
-class Refused(Exception):
-    """Something the user gave cannot be used; the message says what and why."""
+__all__ = ("Experiment", "Measured", "Options", "Refused", "shown")
 
 
 class Measured(NamedTuple):
@@ -47,7 +49,7 @@ class Options(NamedTuple):
 
 
 class Experiment:
-    """One study in progress.
+    """One study in progress; a context, in which no other process works in its folder.
 
     Everything it saves goes into a partial folder that takes its final name in `finish`. `table`,
     `arrays` and `figure` save; `piece` saves work that a later run can resume from; `progress` and
@@ -75,6 +77,7 @@ class Experiment:
         }
         identity = {k: v for k, v in self.about.items() if k != "command"}
         self.folder = Folder(options.out, name, identity)
+        self.folder.claim(options.overwrite)
         self.about |= {
             "source": self.folder.settings["source"],
             "devices": [str(device) for device in jax.devices()],
@@ -82,6 +85,12 @@ class Experiment:
             f"{platform.python_version()}, jax {jax.__version__}, numpy {np.__version__}",
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
+
+    def __enter__(self) -> "Experiment":
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.folder.leave()
 
     def size(self, full: int, quick: int) -> int:
         """How many runs: what the user asked for, or the study's own choice."""
@@ -116,11 +125,21 @@ class Experiment:
         )
         with bar:
             task = bar.add_task(label, total=None)
-            yield lambda done, total, *_: bar.update(task, completed=done, total=total)
+
+            def update(done: int, total: int, *_: Any) -> None:
+                stop_if_asked()
+                bar.update(task, completed=done, total=total)
+
+            yield update
 
     def piece(self, name: str, compute: Callable[[], Mapping[str, Any]]) -> Arrays:
-        """The arrays of `compute()`, read back if an interrupted run has already computed them."""
-        return self.folder.piece(name, compute)
+        """The arrays of `compute()`, read back if an interrupted run has already computed them
+        and they are whole."""
+        found = self.folder.piece(name, compute)
+        if name in self.folder.broken:
+            self.say(f"The earlier work {name!r} was not whole; computed again.")
+            self.folder.broken.remove(name)
+        return found
 
     def table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], notes: Sequence[str] = ()
@@ -145,7 +164,12 @@ class Experiment:
         """Saves labelled arrays as `name`.nc (netCDF 4) with the description of the study."""
         about = {key: str(value) for key, value in self.about.items()}
         labelled = dataset.assign_attrs({**about, **dataset.attrs})
-        self.folder.write(f"{name}.nc", lambda path: labelled.to_netcdf(path, engine="h5netcdf"))
+        # HDF5 crashes the process when it cannot write what is left as it closes a file on a full
+        # disk, so it gets memory.
+        buffer = io.BytesIO()
+        with h5netcdf.File(buffer, "w") as file:
+            labelled.dump_to_store(xr.backends.H5NetCDFStore(file))  # type: ignore[arg-type]
+        self.folder.write(f"{name}.nc", lambda path: path.write_bytes(buffer.getbuffer()))
 
     def figure(self, name: str, figure: Figure) -> None:
         """Saves a figure as `name`.png."""
@@ -162,7 +186,10 @@ class Experiment:
         self.say(f"Results in {self.folder.final} ({seconds}).")
         if earlier is not None:
             self.say(f"The earlier results are kept in {earlier} (--overwrite replaces them).")
-        if self.folder.partial.parent.exists():
+        if self.folder.kept:
+            kept = ", ".join(str(path) for path in self.folder.kept)
+            self.say(f"Kept, for it is not of this program: {kept}.")
+        if self.folder.unfinished():
             self.say(f"Unfinished work with other settings stays in {self.folder.partial.parent}.")
 
 

@@ -53,7 +53,11 @@ def track(arguments: Any, options: Options) -> None:
     if not counted.any():
         raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to score")
     chosen = method(arguments, tracks)
-    experiment = Experiment("track", options, _settings(arguments))
+    with Experiment("track", options, _settings(arguments)) as experiment:
+        _followed(experiment, arguments, readings, tracks, counted, chosen)
+
+
+def _followed(experiment, arguments, readings, tracks, counted, chosen):
     _introduce(experiment, readings, tracks)
     stamped = {"validity": tracks.measurements}
     if readings.columns.arrival is not None:
