@@ -80,7 +80,7 @@ def rmse_loss(
     def charges(batch: Measurement, unknowns: int) -> Any:
         return truth_charges(truth, batch, unknowns)
 
-    charging = _charging(estimator, measurements, charges, unused, setting)
+    charging = charging_of(estimator, measurements, charges, unused, setting)
     return _averaged(charging, truth, scores.squared_error, _root)
 
 
@@ -99,7 +99,7 @@ def likelihood_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    charging = _of_values(estimator, measurements, density_cost, unused, setting)
+    charging = value_charging(estimator, measurements, density_cost, unused, setting)
     return _averaged(charging, None, scores.negative_log_likelihood, _itself)
 
 
@@ -125,7 +125,7 @@ def log_likelihood(
     Returns:
         (); -inf where a value is out of its domain.
     """
-    charging = _of_values(estimator, measurements, density_cost, unused, setting)
+    charging = value_charging(estimator, measurements, density_cost, unused, setting)
     values = charging.scored(params, None, scores.negative_log_likelihood)
     total = jnp.sum(jnp.where(jnp.isnan(values), 0, values))
     return -_or_infinite(total)
@@ -153,7 +153,7 @@ def prediction_loss(
         A function of `params`, differentiable in forward and reverse mode.
     """
     cost = length_cost if robust else squared_cost
-    charging = _of_values(estimator, measurements, cost, unused, setting)
+    charging = value_charging(estimator, measurements, cost, unused, setting)
     if robust:
         return _averaged(charging, None, scores.robust_innovation, _itself)
     return _averaged(charging, None, scores.squared_innovation, _root)
@@ -183,7 +183,7 @@ def nees_loss(
     def charges(batch: Measurement, unknowns: int) -> Any:
         return truth_charges(truth, batch, unknowns)
 
-    charging = _charging(estimator, measurements, charges, unused, setting)
+    charging = charging_of(estimator, measurements, charges, unused, setting)
     return _consistency(charging, truth, scores.normalised_error)
 
 
@@ -200,11 +200,11 @@ def nis_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    charging = _of_values(estimator, measurements, squared_cost, unused, setting)
+    charging = value_charging(estimator, measurements, squared_cost, unused, setting)
     return _consistency(charging, None, scores.normalised_innovation)
 
 
-class _Charging(NamedTuple):
+class Charging(NamedTuple):
     """A batch to score: what it is filtered with, and the charges (R, T) by the states' number."""
 
     estimator: Estimator
@@ -241,36 +241,40 @@ class _Charging(NamedTuple):
         return self.charges(unknowns)
 
 
-def _charging(
+def charging_of(
     estimator: Estimator,
     measurements: Measurement,
     charges: Callable[[Measurement, int], Any],
     unused: Unused,
     setting: dict[str, Any],
-) -> _Charging:
+) -> Charging:
+    """How measurements are scored whose rows cost what `charges` says."""
+
     def fresh(unknowns: int) -> Any:
         return charges(scores.as_batch(measurements), unknowns)
 
     # What is traced belongs to one trace, and must not be kept for the next.
     is_traced = any(isinstance(x, Tracer) for x in measurements)
-    return _Charging(estimator, measurements, setting, fresh if is_traced else cache(fresh), unused)
+    return Charging(estimator, measurements, setting, fresh if is_traced else cache(fresh), unused)
 
 
-def _of_values(
+def value_charging(
     estimator: Estimator,
     measurements: Measurement,
     cost: Callable[..., Any],
     unused: Unused,
     setting: dict[str, Any],
-) -> _Charging:
+) -> Charging:
+    """How measurements are scored whose rows cost `cost` where they are not predicted."""
+
     def charges(batch: Measurement, unknowns: int) -> Any:
         return value_charges(batch, cost, unknowns)
 
-    return _charging(estimator, measurements, charges, unused, setting)
+    return charging_of(estimator, measurements, charges, unused, setting)
 
 
 def _averaged(
-    charging: _Charging, truth: Any, score: Score, finish: Callable[[Array], Array]
+    charging: Charging, truth: Any, score: Score, finish: Callable[[Array], Array]
 ) -> Loss:
     def loss(params: Any) -> Array:
         return _or_infinite(finish(_mean(charging.scored(params, truth, score))))
@@ -278,7 +282,7 @@ def _averaged(
     return loss
 
 
-def _consistency(charging: _Charging, truth: Any, score: Score) -> Loss:
+def _consistency(charging: Charging, truth: Any, score: Score) -> Loss:
     def loss(params: Any) -> Array:
         values = charging.raw(params, truth, score)
         if charging.unused == "leave out":
