@@ -46,7 +46,14 @@ from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
-from ewif_jax.losses import likelihood_loss, nees_loss, nis_loss, prediction_loss, rmse_loss
+from ewif_jax.losses import (
+    likelihood_loss,
+    log_likelihood,
+    nees_loss,
+    nis_loss,
+    prediction_loss,
+    rmse_loss,
+)
 from ewif_jax.models import Model, linear_model
 from ewif_jax.monte_carlo import (
     Scenario,
@@ -133,6 +140,7 @@ __all__ = [
     "likelihood_loss",
     "limited_memory",
     "linear_model",
+    "log_likelihood",
     "losses",
     "maneuvering_index",
     "models",

@@ -191,9 +191,10 @@ def check_runs(
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
         measurements = measurements._replace(sensor=sensors.max(0))
+    one_key = key[0] if key is not None and _one_for_each(key) else key
     for k in {0, *_lowest(params, params_f)}:
         own = one_run(params, params_f, k)
-        validated(estimator, own, measurements, prior, t0, times, clock, key)
+        validated(estimator, own, measurements, prior, t0, times, clock, one_key)
 
 
 def _lowest(params: Any, flags: Any) -> set[int]:

@@ -26,7 +26,7 @@ RANKS = (
     {"recursions", "batch"},
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},
-    {"scores", "continuous"},
+    {"scores", "continuous", "charges"},
     {"losses", "transforms"},
     {"tuning", "monte_carlo"},
     {"scenarios"},

@@ -105,7 +105,7 @@ def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
         return ""
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     run = f" of run {index[0]}" if len(index) > 1 else ""
-    return f"{stamps[index]:.10g} at row {index[-1]}{run}"
+    return f"{stamps[index]:.10g} at row {max(index[-1:])}{run}"
 
 
 def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:

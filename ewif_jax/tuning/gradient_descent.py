@@ -17,12 +17,13 @@ if TYPE_CHECKING:
 
 
 class Tuned(NamedTuple):
-    """The last parameters and loss, and the whole history: loss (steps,) and params (steps, ...)
-    as they were when that loss was computed."""
+    """The best parameters seen and their loss, the whole history: loss (steps,) and params
+    (steps, ...) as they were when that loss was computed, and why the descent ended."""
 
     params: Any
     loss: float
     history: dict[str, Any]
+    reason: str = ""
 
 
 def tune(
@@ -35,7 +36,7 @@ def tune(
     key: Any = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Tuned:
-    """The parameters after gradient descent on `loss`, with the history.
+    """The best parameters of a gradient descent on `loss`, with the history.
 
     Args:
         loss: function params -> (), or (params, key) -> () if `key` is given (a fresh key each
@@ -50,11 +51,13 @@ def tune(
         key: PRNG key for a sampled loss.
         progress: called with (step, steps, loss) after each step.
 
-    A step whose gradient is not finite leaves the parameters as they are; the history shows it.
+    A step to where the loss or its gradient is not finite is not kept: the descent goes on from the
+    best parameters seen, with steps half as large. `Tuned.reason` says so. With a `key`, losses of
+    different steps are not compared, and the last parameters with a finite loss are returned.
 
     Raises:
         ValueError: steps < 1, a parameter that its transform cannot hold, a loss that is not a
-            finite number at the start.
+            finite number at the start, starting values that the loss refuses (a negative tau).
     """
     import optax  # here, because it takes longer to import than the rest of the package
 
@@ -69,6 +72,9 @@ def tune(
             params,
             is_leaf=lambda t: isinstance(t, Transform),
         )
+    # Known numbers are looked at once, before they are traced: a negative tau is refused here.
+    shape = jax.eval_shape(lambda: loss(params) if key is None else loss(params, key)).shape
+    checks.require(shape == (), "loss", "a function that returns one number ()", f"shape {shape}")
     is_transform: Callable[[Any], bool] = lambda t: isinstance(t, Transform)  # noqa: E731
 
     def constrain(free: Any) -> Any:
@@ -81,35 +87,58 @@ def tune(
         checks.require(good, where, "a value that its transform can hold", "one it cannot")
     if optimizer is None:
         optimizer = optax.adam(optax.cosine_decay_schedule(0.1, steps))
-    optimizer = optax.apply_if_finite(optimizer, max_consecutive_errors=steps)
     state = optimizer.init(free)
 
     def objective(free: Any, key: Any) -> Array:
         return loss(constrain(free)) if key is None else loss(constrain(free), key)
 
-    @jax.jit
-    def advance(free: Any, state: Any, key: Any) -> tuple[Any, Any, Array, Any]:
+    def evaluate(free: Any, key: Any) -> tuple[Array, Any, Array, Any]:
         value, gradient = value_and_gradient(objective, free, key)
-        updates, state = optimizer.update(gradient, state, free)
-        return optax.apply_updates(free, updates), state, value, constrain(free)
+        finite = [jnp.all(jnp.isfinite(x)) for x in (value, *jax.tree.leaves(gradient))]
+        return value, gradient, jnp.all(jnp.stack(finite)), constrain(free)
+
+    @jax.jit
+    def advance(free: Any, state: Any, scale: Array, key: Any) -> tuple[Any, ...]:
+        """A step from `free`, whose loss and gradient are known to be used only if finite."""
+        value, gradient, is_finite, params = evaluate(free, key)
+        updates, moved = optimizer.update(gradient, state, free)
+        updates = jax.tree.map(lambda u: scale.astype(u.dtype) * u, updates)
+        return optax.apply_updates(free, updates), moved, value, is_finite, params
 
     losses, trail = [], []
-    for k in range(steps):
-        draw = None if key is None else jax.random.fold_in(key, k)
-        free, state, value, before = advance(free, state, draw)
+    best, kept = None, (free, state)
+    scale, refused = 1.0, 0
+    for k in range(steps + 1):
+        draw = None if key is None else jax.random.fold_in(key, min(k, steps - 1))
+        start = free, state
+        free, state, value, is_finite, shown = advance(free, state, jnp.asarray(scale), draw)
         if k == 0:
             got = f"{float(value)} at the starting values"
             checks.require(np.isfinite(value), "loss", "a finite number", got)
+        if bool(is_finite):
+            kept = start
+            if best is None or key is not None or float(value) <= best[1]:
+                best = shown, float(value), start
+        else:
+            refused += 1
+            scale /= 2
+            free, state = kept if best is None or key is not None else best[2]
+        if k == steps:
+            break
         losses.append(value)
-        trail.append(before)
+        trail.append(shown)
         if progress is not None:
             progress(k + 1, steps, float(value))
     history = {
         "loss": np.asarray(jnp.stack(losses)),
         "params": jax.tree.map(lambda *leaves: np.stack(leaves), *trail),
     }
-    *_, final, params = advance(free, state, draw)
-    return Tuned(params, float(final), history)
+    if best is None:
+        start = jax.tree.map(lambda x: jnp.asarray(x[0]), history["params"])
+        return Tuned(start, float(losses[0]), history, "no gradient was finite: nothing was tuned")
+    told = f"; {refused} of them led to where the loss or its gradient is not finite"
+    reason = f"all {steps} steps were taken{told if refused else ''}"
+    return Tuned(*best[:2], history, reason)
 
 
 def _as_float(x: Any) -> Array:

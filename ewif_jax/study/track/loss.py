@@ -11,7 +11,9 @@ from jax import Array, lax
 from ewif_jax import scores
 from ewif_jax.analysis.consistency import nis
 from ewif_jax.batch import Step, run_batch
-from ewif_jax.scores import average, scored
+from ewif_jax.charges import Cost, density_cost, length_cost, squared_cost
+from ewif_jax.losses import value_charging
+from ewif_jax.scores import average
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.track.method import Method
 from ewif_jax.types import Measurement, Status
@@ -51,32 +53,28 @@ def smooth_median(length: Array) -> Array:
     return jnp.exp(m - (below(m, logs) - below(m, fixed)) / slope)
 
 
-LOSSES: dict[str, tuple[scores.Score, Callable[[Array], Array]]] = {
-    "median": (scores.robust_innovation, smooth_median),
-    "robust": (scores.robust_innovation, average),
-    "squared": (scores.squared_innovation, lambda x: jnp.sqrt(average(x))),
-    "likelihood": (scores.negative_log_likelihood, average),
+LOSSES: dict[str, tuple[scores.Score, Cost, Callable[[Array], Array]]] = {
+    "median": (scores.robust_innovation, length_cost, smooth_median),
+    "robust": (scores.robust_innovation, length_cost, average),
+    "squared": (scores.squared_innovation, squared_cost, lambda x: jnp.sqrt(average(x))),
+    "likelihood": (scores.negative_log_likelihood, density_cost, average),
 }
 
 
 def loss(
     kind: str, method: Method, measurements: Measurement, counted: np.ndarray
 ) -> Callable[[Any], Array]:
-    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T)."""
-    score, finish = LOSSES[kind]
+    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T); those
+    that the filter does not predict are charged."""
+    score, cost, finish = LOSSES[kind]
+    setting = {"prior": method.prior, "t0": 0.0}
+    charging = value_charging(method.estimator, measurements, cost, "charge", setting)
 
-    def of(params: Any) -> Array:
-        values = scored(
-            method.estimator,
-            {**method.params, **params},
-            measurements,
-            scores={"score": score},
-            prior=method.prior,
-            t0=0.0,
-        )
-        return finish(jnp.where(counted, values["score"], jnp.nan))
+    def tracked(params: Any) -> Array:
+        values = charging.scored({**method.params, **params}, None, score)
+        return finish(jnp.where(counted, values, jnp.nan))
 
-    return of
+    return tracked
 
 
 def filtered(method: Method, params: Any, measurements: Measurement) -> dict[str, np.ndarray]:
