@@ -10,9 +10,10 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.trees import copies
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, flow
 from ewif_jax.recursions import particles as form
+from ewif_jax.recursions import weighing
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -71,6 +72,9 @@ def pf_extended(
 
     Reduces to: `bootstrap` in sequence and at delay 0.
 
+    Deviations: resampling, where too few particles count, waits until the filter moves on or the
+        next late measurement draws its states, as in `pf_retrodict`.
+
     Raises:
         ValueError: fewer than 2 particles; lag < 1; collapse < 1; `init` without a key or a prior.
     """
@@ -99,17 +103,19 @@ def pf_extended(
         return form.leave(state, time, go)
 
     def update(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
-        def between(state: PathState) -> tuple[Array, Array]:
-            key, ours = jax.random.split(state.key)
-            return _between(model, params, state, measurement.time, ours), key
+        def drawn_between(state: PathState) -> tuple[PathState, Array]:
+            state, past, key = form.ready_to_draw(kind, state, state.past)
+            state = state._replace(past=past)
+            return state, _between(model, params, state, measurement.time, key)
 
-        late = measurement.time < state.time
-        known = measurement.time >= state.past_times[-1]
-        there, key = lax.cond(late & known, between, lambda s: (s.particles, s.key), state)
-        seen = form.look(model, params, there, state.log_weights, measurement)
-        log_weights, info = form.weigh(state, seen, measurement, known, collapse)
-        used = state.used | form.was_used(info)
-        return state._replace(log_weights=log_weights, key=key, used=used), info
+        within_lag = measurement.time >= state.past_times[-1]
+        reached = weighing.within_reach(measurement, within_lag)
+        late = (measurement.time < state.time) & jnp.any(reached.mask)
+        drawn, there = lax.cond(late, drawn_between, lambda s: (s, s.particles), state)
+        seen = weighing.look(model, params, there, drawn.log_weights, reached)
+        log_weights, info = weighing.weigh(drawn, seen, measurement, within_lag, collapse)
+        updated = drawn._replace(log_weights=log_weights, used=jnp.asarray(True))
+        return choose(weighing.was_used(info), updated, state), info
 
     return Estimator(init, predict, update, form.estimate)
 
