@@ -6,12 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels import symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.covariance import CovarianceState, covariance_form
-from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
+from ewif_jax.recursions.sigma_points import SigmaPoints, measure_around, move_around, transform
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
@@ -32,7 +31,9 @@ def unscented(
     to which Q or R is added (Julier & Uhlmann 2004; van der Merwe 2004): noise is additive. New
     points are drawn for every prediction and for every measurement. Measurements are compared with
     the one predicted at the mean through `model.residual`, so bearings around :math:`\pm\pi` have
-    the right mean. Late measurements, masks and singular matrices as in `kalman`.
+    the right mean. A linear model's moments are those of its matrices, without points. In a
+    nonlinear one covariances are kept as sums of squares, so that no variance is below zero where
+    all weights are positive. Late measurements, masks and singular matrices as in `kalman`.
 
     Args:
         model: linear or not; no derivative of it is needed.
@@ -62,8 +63,7 @@ def unscented(
     def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, ahead)
-        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
+        mean, cov = move_around(model, points, params, state.mean, state.cov, state.time, ahead)
         moved = choose(time > state.time, CovarianceState(time, mean, cov), state)
         known = time >= state.time
         return CovarianceState(
@@ -74,6 +74,7 @@ def unscented(
         params: Any, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
         late, present = measurement.time < state.time, jnp.any(measurement.mask)
+        measurement = measurement._replace(mask=measurement.mask & ~late)
         mean, cov, info = measure_around(model, points, params, state.mean, state.cov, measurement)
         good = info.status == Status.USED
         used = present & ~late & good

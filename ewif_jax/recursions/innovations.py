@@ -54,11 +54,15 @@ def updated(
     its `Info` (delay 0, status USED or REJECTED)."""
     (difference, H, R, mask), good = sound(model, cov, seen)
     mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask, H_where)
-    info = Info(
+    return mean, cov, info_of(innovation, mask, good)
+
+
+def info_of(innovation: gaussian.Innovation, mask: Array, good: Array) -> Info:
+    """The `Info` of a measurement taken to be in sequence, USED or REJECTED."""
+    return Info(
         innovation.value,
         innovation.cov,
         gaussian.log_density(innovation, mask),
-        jnp.zeros((), mean.dtype),
+        jnp.zeros((), innovation.value.dtype),
         jnp.where(good, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),
     )
-    return mean, cov, info

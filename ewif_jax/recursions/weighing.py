@@ -140,7 +140,7 @@ def about(
     model: Model, origin: Array, predicted: Array, numbers: Array, measurement: Measurement
 ) -> Array:
     """The predicted values (m, N) less `origin`, 0 where they are absent or not a number."""
-    good = measurement.mask[:, None] & numbers
+    good = measurement.mask[:, None] & numbers[None]
     safe = jnp.where(good, predicted, origin[:, None])
     offsets = jax.vmap(lambda seen: model.residual(seen, origin, measurement.sensor), -1, -1)(safe)
     return jnp.where(good, offsets, 0)
