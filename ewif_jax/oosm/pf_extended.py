@@ -14,6 +14,7 @@ from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, flow
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
+from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -103,30 +104,42 @@ def pf_extended(
         return form.leave(state, time, go)
 
     def update(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
-        def drawn_between(state: PathState) -> tuple[PathState, Array]:
-            state, past, key = form.ready_to_draw(kind, state, state.past)
-            state = state._replace(past=past)
-            return state, _between(model, params, state, measurement.time, key)
+        in_order, before = jnp.arange(particles, dtype=jnp.int32), ParticleState(*state[:4])
+
+        def drawn_between(cloud: ParticleState) -> tuple[ParticleState, Array, Array]:
+            cloud, order, key = form.ready_to_draw(kind, cloud, in_order)
+            ends = state._replace(particles=cloud.particles)
+            return cloud, _between(model, params, ends, order, measurement.time, key), order
 
         within_lag = measurement.time >= state.past_times[-1]
         reached = weighing.within_reach(measurement, within_lag)
         late = (measurement.time < state.time) & jnp.any(reached.mask)
-        drawn, there = lax.cond(late, drawn_between, lambda s: (s, s.particles), state)
+        drawn, there, order = lax.cond(
+            late, drawn_between, lambda cloud: (cloud, cloud.particles, in_order), before
+        )
         seen = weighing.look(model, params, there, drawn.log_weights, reached)
         log_weights, info = weighing.weigh(drawn, seen, measurement, within_lag, collapse)
-        updated = drawn._replace(log_weights=log_weights, used=jnp.asarray(True))
-        return choose(weighing.was_used(info), updated, state), info
+        used = weighing.was_used(info)
+        cloud = choose(used, drawn._replace(log_weights=log_weights), before)
+        # The paths follow at the end, so that no branch has to copy them.
+        follow = late & used & jnp.any(order != in_order)
+        past = lax.cond(follow, lambda x: x[..., order], lambda x: x, state.past)
+        return state._replace(**cloud._asdict(), used=state.used | used, past=past), info
 
     return Estimator(init, predict, update, form.estimate)
 
 
-def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:
-    """Draws of the states at `time` (n, N), given where each particle was before and after."""
+def _between(
+    model: Model, params: Any, state: PathState, order: Array, time: Array, key: Array
+) -> Array:
+    """Draws of the states at `time` (n, N), given where each particle was before and after: those
+    now are copies, in this `order` (N,), of those that the stored paths belong to."""
     times = jnp.concatenate([state.time[None], state.past_times])
     newer = jnp.clip(jnp.sum(times > time), 1, state.past_times.shape[0])
     start, end = times[newer], times[newer - 1]
-    before = state.past[newer - 1]
-    after = jnp.where(newer == 1, state.particles, state.past[jnp.maximum(newer - 2, 0)])
+    before = state.past[newer - 1][:, order]
+    between = state.past[jnp.maximum(newer - 2, 0)][:, order]
+    after = jnp.where(newer == 1, state.particles, between)
     time = jnp.clip(time, start, end)
 
     def draw(x: Array, target: Array, normals: Array) -> Array:
