@@ -6,6 +6,7 @@ from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
+from ewif_jax.recursions import weighing
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -73,8 +74,9 @@ def bootstrap(
     def update(
         params: Any, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
-        seen = form.look(model, params, state.particles, state.log_weights, measurement)
-        log_weights, info = form.weigh(state, seen, measurement, reachable=False)
+        in_sequence = weighing.within_reach(measurement, measurement.time >= state.time)
+        seen = weighing.look(model, params, state.particles, state.log_weights, in_sequence)
+        log_weights, info = weighing.weigh(state, seen, measurement, reachable=False)
         return state._replace(log_weights=log_weights), info
 
     return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

@@ -31,14 +31,16 @@ def ensemble(
     :math:`h(x_i)`, :math:`P_{zz} = P_{hh} + R` and the gain :math:`K = P_{xz} P_{zz}^{-1}`.
 
     * "stochastic": :math:`x_i \leftarrow x_i + K (z - h(x_i) - w_i)`, each member with its own
-      measurement noise (Burgers, van Leeuwen & Evensen 1998).
+      measurement noise (Burgers, van Leeuwen & Evensen 1998), as
+      :math:`x_i + K (\nu - (h(x_i) - \hat z) - w_i)` with one innovation :math:`\nu` for all.
     * "square_root": :math:`\hat x \leftarrow \hat x + K (z - \hat z)`, and the deviations by
       :math:`e_i \leftarrow e_i - P_{xz} L'^{-1} (L + G)^{-1} (h(x_i) - \hat z)` with
       :math:`P_{zz} = L L',\; R = G G'` (Andrews 1968; Whitaker & Hamill 2002), so that the sample
       covariance is :math:`P - K P_{zz} K'` exactly; for one number it is the ensemble transform
       filter. Only process noise is drawn.
 
-    Innovations go through `model.residual` for each member, means of angles relative to the
+    The innovation :math:`\nu` of the mean goes through `model.residual` once, so that an angle far
+    from its prediction turns all members the same way; means of angles are relative to the
     measurement predicted at the mean. Late measurements, masks and singular Q, P and R as in
     `kalman`. The members are functions of `params` and of fixed random numbers, so gradients are
     those of one realisation.
@@ -79,10 +81,11 @@ def ensemble(
     ) -> tuple[EnsembleState, Info]:
         late, present = measurement.time < state.time, jnp.any(measurement.mask)
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
-        looked = ensembles.look(model, params, state.members, state.members, measurement)
+        in_sequence = measurement._replace(mask=measurement.mask & ~late)
+        looked = ensembles.look(model, params, state.members, state.members, in_sequence)
         used = present & ~late & looked.good
         if form == "stochastic":
-            updated = ensembles.perturbed(model, state.members, looked, measurement, own)
+            updated = ensembles.perturbed(state.members, looked, own)
         else:
             updated = ensembles.transformed(state.members, looked)
         delay = state.time - measurement.time

@@ -11,7 +11,7 @@ from ewif_jax.models.linearise import need_linear, predict_state
 from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
-from ewif_jax.recursions.innovations import compared, unjudged
+from ewif_jax.recursions.innovations import compared, info_of
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -69,7 +69,7 @@ def square_root(model: Model) -> Estimator:
         )
         white = cholesky.forward(factor, innovation.value)
         updated = RootState(state.time, state.mean + crossed @ white, root)
-        return updated, unjudged(innovation, mask)
+        return updated, info_of(innovation, mask)
 
     def estimate(params: Any, state: RootState) -> Gaussian:
         del params

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
@@ -10,10 +9,10 @@ from ewif_jax.kernels import symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
-from ewif_jax.recursions.contract import verdict
-from ewif_jax.recursions.covariance import CovarianceState, covariance_form
-from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.sigma_points import SigmaPoints, measure_around, move_around, transform
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 @from_recipe
@@ -34,7 +33,9 @@ def unscented(
     to which Q or R is added (Julier & Uhlmann 2004; van der Merwe 2004): noise is additive. New
     points are drawn for every prediction and for every measurement. Measurements are compared with
     the one predicted at the mean through `model.residual`, so bearings around :math:`\pm\pi` have
-    the right mean. Late measurements, masks and singular matrices as in `kalman`.
+    the right mean. A linear model's moments are those of its matrices, without points. In a
+    nonlinear one covariances are kept as sums of squares, so that no variance is below zero where
+    all weights are positive. Late measurements, masks and singular matrices as in `kalman`.
 
     Args:
         model: linear or not; no derivative of it is needed.
@@ -54,36 +55,25 @@ def unscented(
     """
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa)
-    form = covariance_form(model, "unscented")
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
-        state = form.init(params, prior, t0, key)
-        transform(points, params, state.mean.shape[0], state.mean.dtype)
-        return state
+    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> CovarianceState:
+        del key
+        transform(points, params, prior.mean.shape[0], prior.mean.dtype)
+        return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
-    def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow_around(model, points, params, state.mean, state.cov, state.time, ahead)
-        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
-        moved = choose(time > state.time, CovarianceState(time, mean, cov), state)
-        known = time >= state.time
-        return CovarianceState(
-            time, jnp.where(known, moved.mean, jnp.nan), jnp.where(known, moved.cov, jnp.nan)
-        )
+    def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+        mean, cov = move_around(model, points, params, state.mean, state.cov, state.time, time)
+        # Points drawn to stand still would round what they stand for.
+        return choose(time > state.time, CovarianceState(time, mean, cov), state)
 
-    def update(
+    def measure(
         params: Any, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
-        late, present = measurement.time < state.time, jnp.any(measurement.mask)
         mean, cov, info = measure_around(model, points, params, state.mean, state.cov, measurement)
-        good = info.status == Status.USED
-        used = present & ~late & good
-        info = info._replace(
-            log_likelihood=jnp.where(used, info.log_likelihood, 0),
-            delay=state.time - measurement.time,
-            status=verdict(late, present, good=good),
-        )
-        return choose(used, CovarianceState(state.time, mean, cov), state), info
+        return CovarianceState(state.time, mean, cov), info
 
-    return form._replace(init=init, predict=predict, update=update)
+    def estimate(params: Any, state: CovarianceState) -> Gaussian:
+        del params
+        return Gaussian(state.mean, symmetric.unpack(state.cov))
+
+    return estimator_from(Recursion("unscented", start, move, measure, estimate, model=model))

@@ -33,6 +33,7 @@ def ancestors(key: Array, log_weights: Array, method: Resampling) -> Array:
         u = jax.random.uniform(key, (), w.dtype)
     else:
         u = jax.random.uniform(key, (N,), w.dtype)[jnp.minimum(slot, N - 1)]
-    first = jnp.where(w > 0, slot + (u < share - slot), N)
+    beyond = (u < share - slot.astype(w.dtype)).astype(jnp.int32)
+    first = jnp.where(w > 0, slot + beyond, N)
     marks = jnp.zeros(N, jnp.int32).at[first].max(jnp.arange(N, dtype=jnp.int32), mode="drop")
     return lax.cummax(marks)

@@ -1,10 +1,21 @@
 """The unscented transform as a linearisation: a slope, and what a straight line leaves over."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax.fast.small import matmul
-from ewif_jax.kernels import cholesky
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.kernels import cholesky, gaussian, symmetric
+
+
+class Regression(NamedTuple):
+    """A function of a Gaussian of covariance L L' as a straight line: the shift (m,) of its mean,
+    its slope (m, n) along the columns of L, and the covariance (m, m) that the line leaves over."""
+
+    shift: Array
+    slope: Array
+    left_over: Array
 
 
 def offsets(lower: Array, scale: Array) -> Array:
@@ -13,28 +24,54 @@ def offsets(lower: Array, scale: Array) -> Array:
     return jnp.concatenate([columns, -columns], 1)
 
 
-def regression(
-    differences: Array, root: cholesky.Factor, scale: Array, centre: Array
-) -> tuple[Array, Array, Array]:
-    r"""Mean shift (m,), slope (m, n) and left-over covariance (m, m) of a function of a Gaussian.
+def regression(differences: Array, scale: Array, centre: Array) -> Regression:
+    r"""The straight line through a function of a Gaussian.
 
     `differences` (m, 2n) are the function's values at the points minus its value at the mean,
-    `root` the factor L of P, `scale` is c = n + lambda and `centre` the covariance weight of the
-    central point. With :math:`d_j^\pm` the differences from the transformed mean,
+    `scale` is c = n + lambda and `centre` the covariance weight of the central point. With
+    :math:`d_j^\pm` the differences from the transformed mean and :math:`A` the slope,
 
     .. math::
-        A L = \frac{d^+ - d^-}{2 \sqrt c}, \quad
+        D = A L = \frac{d^+ - d^-}{2 \sqrt c}, \quad
         \Omega = \frac{(d^+ + d^-)(d^+ + d^-)'}{4 c} + w_0\, s s'
 
-    The unscented covariances are then exactly :math:`P_{xy} = P A'`,
-    :math:`P_{yy} = A P A' + \Omega`: nothing is subtracted, and a linear function leaves no
-    :math:`\Omega`. Directions without variance have slope zero.
+    The unscented covariances are then exactly :math:`P_{xy} = L D'`,
+    :math:`P_{yy} = D D' + \Omega`: nothing is subtracted, and a linear function leaves no
+    :math:`\Omega`.
     """
     n = differences.shape[1] // 2
     shift = jnp.sum(differences, 1) / (2 * scale)
     around = (differences - shift[:, None]) / (2 * jnp.sqrt(scale))
     ahead, behind = around[:, :n], around[:, n:]
     bend = ahead + behind
-    slope = cholesky.backward(root, (ahead - behind).T).T
     left_over = matmul(bend, bend.T) + centre * (shift[:, None] * shift[None, :])
-    return shift, slope, left_over
+    return Regression(shift, ahead - behind, left_over)
+
+
+def slope_of(line: Regression, root: cholesky.Factor) -> Array:
+    """The slope A (m, n) along the axes: zero in directions without variance."""
+    return cholesky.backward(root, line.slope.T).T
+
+
+def update(
+    mean: Array, lower: Array, difference: Array, slope: Array, R: Array, mask: Array
+) -> tuple[Array, Array, gaussian.Innovation]:
+    r"""Mean and packed covariance of a Gaussian of covariance L L' after a measurement, with the
+    innovation; `slope` D (m, n) along the columns of L, `R` (m, m) all that is not D D'.
+
+    .. math::
+        W = S^{-1} D, \quad K = L W', \quad P = T T' + K R K', \quad T = L (I - W' D)
+
+    the Joseph form in units of L: squares, so that no variance is below zero, and without the
+    slope along the axes, which would be a quotient by the smallest variances of L.
+    """
+    D, R = jnp.where(mask[:, None], slope, 0), gaussian.mask_cov(R, mask)
+    cov = matmul(D, D.T) + R
+    factor = cholesky.factor(cov)
+    weights = cholesky.solve(factor, D)
+    gain = matmul(lower, weights.T)
+    value = jnp.where(mask, difference, 0)
+    left = matmul(lower, jnp.eye(mean.shape[0], dtype=mean.dtype) - matmul(weights.T, D))
+    packed = symmetric.pack(matmul(left, left.T) + matmul(matmul(gain, R), gain.T))
+    innovation = gaussian.Innovation(value, cov, factor, matmul(D, lower.T))
+    return mean + matvec(gain, value), packed, innovation

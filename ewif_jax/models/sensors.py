@@ -67,8 +67,10 @@ def bearing_sensor(r: Any, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
 
 
 def wrap_angle(angle: Array) -> Array:
-    """The same direction in (-pi, pi]."""
-    return jnp.pi - jnp.mod(jnp.pi - angle, 2 * jnp.pi)
+    """The same direction in (-pi, pi]; NaN where the dtype does not resolve turns any more."""
+    # An angle within (-pi, pi] stays what it is to the last bit, however small.
+    wrapped = angle - 2 * jnp.pi * jnp.ceil((angle - jnp.pi) / (2 * jnp.pi))
+    return jnp.where(jnp.abs(wrapped) <= 4, wrapped, jnp.nan)
 
 
 def _covariance(r: Any, m: int) -> Callable[..., Array]:

@@ -10,10 +10,12 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.trees import copies
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, predict_state
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
+from ewif_jax.recursions import weighing
+from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -73,6 +75,9 @@ def pf_extended(
 
     Reduces to: `bootstrap` in sequence and at delay 0.
 
+    Deviations: resampling, where too few particles count, waits until the filter moves on or the
+        next late measurement draws its states, as in `pf_retrodict`.
+
     Raises:
         ValueError: fewer than 2 particles; lag < 1; collapse < 1; `init` without a key or a prior.
     """
@@ -101,28 +106,42 @@ def pf_extended(
         return form.leave(state, time, go)
 
     def update(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
-        def between(state: PathState) -> tuple[Array, Array]:
-            key, ours = jax.random.split(state.key)
-            return _between(model, params, state, measurement.time, ours), key
+        in_order, before = jnp.arange(particles, dtype=jnp.int32), ParticleState(*state[:4])
 
-        late = measurement.time < state.time
-        known = measurement.time >= state.past_times[-1]
-        there, key = lax.cond(late & known, between, lambda s: (s.particles, s.key), state)
-        seen = form.look(model, params, there, state.log_weights, measurement)
-        log_weights, info = form.weigh(state, seen, measurement, known, collapse)
-        used = state.used | form.was_used(info)
-        return state._replace(log_weights=log_weights, key=key, used=used), info
+        def drawn_between(cloud: ParticleState) -> tuple[ParticleState, Array, Array]:
+            cloud, order, key = form.ready_to_draw(kind, cloud, in_order)
+            ends = state._replace(particles=cloud.particles)
+            return cloud, _between(model, params, ends, order, measurement.time, key), order
+
+        within_lag = measurement.time >= state.past_times[-1]
+        reached = weighing.within_reach(measurement, within_lag)
+        late = (measurement.time < state.time) & jnp.any(reached.mask)
+        drawn, there, order = lax.cond(
+            late, drawn_between, lambda cloud: (cloud, cloud.particles, in_order), before
+        )
+        seen = weighing.look(model, params, there, drawn.log_weights, reached)
+        log_weights, info = weighing.weigh(drawn, seen, measurement, within_lag, collapse)
+        used = weighing.was_used(info)
+        cloud = choose(used, drawn._replace(log_weights=log_weights), before)
+        # The paths follow at the end, so that no branch has to copy them.
+        follow = late & used & jnp.any(order != in_order)
+        past = lax.cond(follow, lambda x: x[..., order], lambda x: x, state.past)
+        return state._replace(**cloud._asdict(), used=state.used | used, past=past), info
 
     return Estimator(init, predict, update, form.estimate, model=model)
 
 
-def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:
-    """Draws of the states at `time` (n, N), given where each particle was before and after."""
+def _between(
+    model: Model, params: Any, state: PathState, order: Array, time: Array, key: Array
+) -> Array:
+    """Draws of the states at `time` (n, N), given where each particle was before and after: those
+    now are copies, in this `order` (N,), of those that the stored paths belong to."""
     times = jnp.concatenate([state.time[None], state.past_times])
     newer = jnp.clip(jnp.sum(times > time), 1, state.past_times.shape[0])
     start, end = times[newer], times[newer - 1]
-    before = state.past[newer - 1]
-    after = jnp.where(newer == 1, state.particles, state.past[jnp.maximum(newer - 2, 0)])
+    before = state.past[newer - 1][:, order]
+    between = state.past[jnp.maximum(newer - 2, 0)][:, order]
+    after = jnp.where(newer == 1, state.particles, between)
     time = jnp.clip(time, start, end)
 
     def draw(x: Array, target: Array, normals: Array) -> Array:

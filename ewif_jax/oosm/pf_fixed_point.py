@@ -10,17 +10,18 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.trees import copies
+from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, predict_measurement
 from ewif_jax.oosm.history import last_before
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
+from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.fixed_point import Conditional, fixed_point, given
 from ewif_jax.recursions.innovations import numbers
 from ewif_jax.recursions.particle_smoother import lines, look_back
-from ewif_jax.recursions.particles import Seen
 from ewif_jax.recursions.sigma_points import SigmaPoints, transform
+from ewif_jax.recursions.weighing import Seen
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 Smoother = Literal["eks", "uks", "ps"]
@@ -116,38 +117,39 @@ def pf_fixed_point(
         if points is not None:
             transform(points, params, 2 * first.particles.shape[0], dtype)
         cov = symmetric.pack(jnp.asarray(prior.cov, dtype))
-        known = CovarianceState(first.time, jnp.asarray(prior.mean), cov)
-        m = _size(model, params, known)
+        told = CovarianceState(first.time, jnp.asarray(prior.mean), cov)
+        m = _size(model, params, told)
         nothing = Measurement(
             first.time, jnp.zeros(m, dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
         )
-        past, measured = copies((known, nothing), slots)
+        past, measured = copies((told, nothing), slots)
         return SummaryState(*first, past, measured)
 
     def update(
         params: Any, state: SummaryState, measurement: Measurement
     ) -> tuple[SummaryState, Info]:
-        late = measurement.time < state.time
-        known, start = last_before(state.past, measurement.time)
+        within_lag, start = last_before(state.past, measurement.time)
+        reached = weighing.within_reach(measurement, within_lag)
+        late = (measurement.time < state.time) & jnp.any(reached.mask)
         tau = jnp.clip(measurement.time, start.time, state.time)
 
         def in_sequence(state: SummaryState) -> tuple[Seen, Array]:
-            seen = form.look(model, params, state.particles, state.log_weights, measurement)
-            return seen, state.key
+            weights = state.log_weights
+            return weighing.look(model, params, state.particles, weights, reached), state.key
 
         def smoothed(state: SummaryState) -> tuple[Seen, Array]:
             key, ours = jax.random.split(state.key)
             stored = jax.tree.map(lambda x: x[::-1], state.measured)
             if smoother == "ps":
                 last = lines(model, params, start, tau, stored, state.time, few, ours)
-                return look_back(model, params, last, state.time, state, measurement), key
+                return look_back(model, params, last, state.time, state, reached), key
             past = fixed_point(model, points, params, start, tau, stored, state.time)
-            return _look_through(model, params, past, state, measurement), key
+            return _look_through(model, params, past, state, reached), key
 
-        seen, key = lax.cond(late & known, smoothed, in_sequence, state)
-        log_weights, info = form.weigh(state, seen, measurement, known, collapse)
+        seen, key = lax.cond(late, smoothed, in_sequence, state)
+        log_weights, info = weighing.weigh(state, seen, measurement, within_lag, collapse)
         weighed = state._replace(log_weights=log_weights, key=key)
-        return _remembered(weighed, measurement, form.was_used(info)), info
+        return choose(weighing.was_used(info), _remembered(weighed, measurement), state), info
 
     return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
 
@@ -164,7 +166,7 @@ def _look_through(
     """A late measurement as it is seen by particles now, through the state at its time."""
     time, value, sensor, mask = measurement
 
-    def one(x: Array) -> tuple[Array, Array, Array, Array]:
+    def seen_through(x: Array) -> tuple[Array, Array, Array, Array, Array]:
         there = given(past, x)
         predicted, H, R = predict_measurement(model, params, there.mean, sensor, time)
         checks.shape("measurement.value", value, (R.shape[0],))
@@ -173,15 +175,17 @@ def _look_through(
         good = numbers(difference, cov, mask)
         difference, cov = jnp.where(good, difference, 0), jnp.where(good, cov, R)
         innovation = gaussian.innovate(difference, H, cov, mask)
-        return difference, innovation.cov, gaussian.log_density(innovation, mask), good
+        return there.mean, predicted, innovation.cov, gaussian.log_density(innovation, mask), good
 
-    difference, cov, log_density, good = jax.vmap(one, -1, -1)(state.particles)
-    weights = jnp.exp(state.log_weights)
-    innovation, spread = form.moments(difference, jnp.where(good, weights, 0))
-    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, cov @ weights + spread)
+    there, predicted, cov, log_density, good = jax.vmap(seen_through, -1, -1)(state.particles)
+    innovation, spread = weighing.averaged(
+        model, params, there, predicted, good, state.log_weights, measurement
+    )
+    cov = cov @ weighing.shares(state.log_weights, good) + spread
+    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, weighing.judged(cov, good))
 
 
-def _remembered(state: SummaryState, measurement: Measurement, used: Array) -> SummaryState:
+def _remembered(state: SummaryState, measurement: Measurement) -> SummaryState:
     """The state with its present mean and covariance in place of those of the same time, or, after
     an in-sequence measurement or at a new time, in front of them."""
     mean, cov = form.summary(state)
@@ -189,19 +193,11 @@ def _remembered(state: SummaryState, measurement: Measurement, used: Array) -> S
     late = measurement.time < state.time
     taken = measurement._replace(time=state.time, mask=measurement.mask & ~late)
     again = late & (state.past.time[0] == state.time)
-
-    def push(table: Any, row: Any) -> Any:
-        return jax.tree.map(lambda x, new: jnp.concatenate([new[None], x[:-1]]), table, row)
-
-    def replaced(table: Any, row: Any) -> Any:
-        return jax.tree.map(lambda x, new: x.at[0].set(new), table, row)
-
-    pushed = push(state.past, now), push(state.measured, taken)
-    rewritten = replaced(state.past, now), state.measured
-    past, measured = jax.tree.map(
-        lambda a, b, c: jnp.where(used, jnp.where(again, a, b), c),
-        rewritten,
-        pushed,
+    pushed = jax.tree.map(
+        lambda row, table: jnp.concatenate([row[None], table[:-1]]),
+        (now, taken),
         (state.past, state.measured),
     )
+    rewritten = jax.tree.map(lambda row, table: table.at[0].set(row), now, state.past)
+    past, measured = choose(again, (rewritten, state.measured), pushed)
     return state._replace(past=past, measured=measured)

@@ -2,15 +2,16 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax.kernels.resampling import Resampling
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
-from ewif_jax.recursions.particles import ParticleState, Seen
+from ewif_jax.recursions import weighing
+from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -51,7 +52,10 @@ def pf_retrodict(
     Raises:
         ValueError: fewer than 2 particles; collapse < 1; `init` without a key or a prior.
 
-    Deviations: (91) prints x(k|l) for x(k|l+). Resampling (step 8) waits until the filter moves on.
+    Deviations: (91) prints x(k|l) for x(k|l+). Resampling (step 8), where too few particles count,
+        waits until the filter moves on or the next late measurement draws its noise, so that
+        estimates do not carry its noise: of measurements that arrive together each meets a cloud
+        that was resampled after the one before.
     """
     kind = form.cloud(model, particles, resampling, ess_threshold)
     collapse = form.collapse_factor(collapse)
@@ -63,17 +67,18 @@ def pf_retrodict(
     def update(
         params: Any, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
-        def back(state: ParticleState) -> tuple[Array, Array]:
-            key, ours = jax.random.split(state.key)
+        def moved_back(state: ParticleState) -> tuple[ParticleState, Array]:
+            state, _, key = form.ready_to_draw(kind, state)
             then = jnp.minimum(measurement.time, state.time)
             Q = jnp.asarray(model.process_cov(params, then, state.time), state.time.dtype)
-            origin = state.particles - form.noise(ours, Q, particles)
-            return form.transported(model, params, origin, state.time, then), key
+            origin = state.particles - form.noise(key, Q, particles)
+            return state, form.transported(model, params, origin, state.time, then)
 
-        late = measurement.time < state.time
-        there, key = lax.cond(late, back, lambda s: (s.particles, s.key), state)
-        seen: Seen = form.look(model, params, there, state.log_weights, measurement)
-        log_weights, info = form.weigh(state, seen, measurement, True, collapse)
-        return state._replace(log_weights=log_weights, key=key), info
+        late = (measurement.time < state.time) & jnp.any(measurement.mask)
+        drawn, there = lax.cond(late, moved_back, lambda s: (s, s.particles), state)
+        seen = weighing.look(model, params, there, drawn.log_weights, measurement)
+        log_weights, info = weighing.weigh(drawn, seen, measurement, True, collapse)
+        updated = drawn._replace(log_weights=log_weights)
+        return choose(weighing.was_used(info), updated, state), info
 
     return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

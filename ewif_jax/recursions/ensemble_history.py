@@ -88,16 +88,17 @@ def delayed(
         time, now = measurement.time, state.now
         late, present = time < state.time, jnp.any(measurement.mask)
         newer = jnp.sum(state.past.time > time)
-        known = newer < lag
+        within_lag = newer < lag
+        reached = measurement._replace(mask=measurement.mask & within_lag)
         own, sight = ensembles.sight_keys(now.sight, measurement.sensor)
-        back = ensembles.back_key(now.sight)
+        motion = ensembles.back_key(now.sight)
         bracket = _interpolated(state, jnp.minimum(newer, lag - 1), time)
-        there = retrodict(params, state, bracket, jnp.minimum(time, state.time), back)
+        there = retrodict(params, state, bracket, jnp.minimum(time, state.time), motion)
         there = jnp.where(late, there, now.members)
-        looked = ensembles.look(model, params, now.members, there, measurement)
-        updated = ensembles.perturbed(model, now.members, looked, measurement, own)
-        used = known & present & looked.good
-        late_status = jnp.where(known, Status.LATE_USED, Status.TOO_LATE)
+        looked = ensembles.look(model, params, now.members, there, reached)
+        updated = ensembles.perturbed(now.members, looked, own)
+        used = within_lag & present & looked.good
+        late_status = jnp.where(within_lag, Status.LATE_USED, Status.TOO_LATE)
         status = verdict(late, present, late_status, looked.good)
         info = ensembles.info_of(looked, state.time - time, used, status)
         taken = state._replace(

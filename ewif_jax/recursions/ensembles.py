@@ -28,11 +28,10 @@ class EnsembleState(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What an ensemble makes of a measurement: seen (m, N), what its members predict, deviations
-    (m, N) from their mean, the noise root G (m, m) with R = G G', the innovation, and mask (m,) of
-    what is used: nothing if innovation or log density are not finite (good () is False then)."""
+    """What an ensemble makes of a measurement: deviations (m, N) of what its members predict from
+    their mean, the noise root G (m, m) with R = G G', the innovation, and mask (m,) of what is
+    used: nothing if innovation or log density are not finite (good () is False then)."""
 
-    seen: Array
     deviations: Array
     noise: Array
     innovation: gaussian.Innovation
@@ -110,39 +109,36 @@ def look(model: Model, params: Any, members: Array, there: Array, measurement: M
     """The measurement as predicted by the members `there` (n, N) at its time; `innovation.cross`
     relates it to `members`."""
     sensor, mask = measurement.sensor, measurement.mask
-    middle = jnp.mean(there, 1)
+    middle = mean_of(there)
     see, R = view(model, params, sensor, measurement.time, middle)
     origin = see(middle)
     checks.shape("measurement.value", measurement.value, origin.shape)
     checks.shape("R", R, origin.shape * 2)
-    seen = jax.vmap(see, in_axes=1, out_axes=1)(there)
 
-    def offset(value: Array) -> Array:
-        return model.residual(value, origin, sensor)
+    def offset(x: Array) -> Array:
+        return model.residual(see(x), origin, sensor)
 
-    offsets = jax.vmap(offset, in_axes=1, out_axes=1)(seen)
-    shift = jnp.mean(offsets, 1)
-    known = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
-    deviations = jnp.where(mask[:, None] & known, offsets - shift[:, None], 0)
+    offsets = jax.vmap(offset, in_axes=1, out_axes=1)(there)
+    shift = mean_of(offsets)
+    all_finite = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
+    deviations = jnp.where(mask[:, None] & all_finite, offsets - shift[:, None], 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
     cov = spread(deviations) + R
-    good = known & numbers(difference, cov, mask)
+    good = all_finite & numbers(difference, cov, mask)
     mask = mask & good
     innovation = gaussian.innovate(difference, covariance(deviations, members), cov, mask)
     root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
-    return Look(seen, jnp.where(good, deviations, 0), root, innovation, mask, good)
+    return Look(jnp.where(good, deviations, 0), root, innovation, mask, good)
 
 
-def perturbed(
-    model: Model, members: Array, looked: Look, measurement: Measurement, key: Array
-) -> Array:
-    """Each member moved by the gain times its own innovation z - (z_i + w_i)."""
+def perturbed(members: Array, looked: Look, key: Array) -> Array:
+    """Each member moved by the gain times its own innovation, nu - (z_i - mean z) - w_i.
 
-    def innovation(expected: Array) -> Array:
-        return model.residual(measurement.value, expected, measurement.sensor)
-
+    Only nu has been wrapped. Wrapped one by one, the innovations of angles far from the prediction
+    would fall on both sides of the cut, and members would part that the gain takes for close.
+    """
     drawn = noise(key, looked.noise, members.shape[1])
-    own = jax.vmap(innovation, in_axes=1, out_axes=1)(looked.seen + drawn)
+    own = looked.innovation.value[:, None] - looked.deviations - drawn
     own = jnp.where(looked.mask[:, None], own, 0)
     return members + matmul(gaussian.gain(looked.innovation), own)
 
@@ -169,9 +165,15 @@ def info_of(looked: Look, delay: Array, used: Array, status: Array) -> Info:
     return Info(value, cov, jnp.where(used, density, 0), delay, status)
 
 
+def mean_of(members: Array) -> Array:
+    """The sample mean (n,) of members (n, N)."""
+    # About one of them: a sum of large numbers would round away the spread of close ones.
+    return members[:, 0] + jnp.mean(members - members[:, :1], 1)
+
+
 def covariance(a: Array, b: Array) -> Array:
     """The sample covariance (p, q) of a (p, N) with b (q, N), where a has mean zero."""
-    centred = b - jnp.mean(b, 1, keepdims=True)
+    centred = b - mean_of(b)[:, None]
     return jnp.matmul(a, centred.T, precision=jax.lax.Precision.HIGHEST) / (a.shape[1] - 1)
 
 
@@ -182,7 +184,7 @@ def spread(deviations: Array) -> Array:
 
 def moments(members: Array) -> Gaussian:
     """Sample mean (n,) and covariance (n, n) of members (n, N)."""
-    mean = jnp.mean(members, 1)
+    mean = mean_of(members)
     return Gaussian(mean, spread(members - mean[:, None]))
 
 
@@ -223,7 +225,7 @@ def fuse_ensembles(ensembles: Any) -> Array:
 
 def uncorrelated(members: Array, d: Array) -> Array:
     """The members (n, N) less their regression on d (n, N): x_i - P_xd P_dd^-1 d_i."""
-    deviations = d - jnp.mean(d, 1, keepdims=True)
+    deviations = d - mean_of(d)[:, None]
     weights = cholesky.solved(spread(deviations), covariance(deviations, members))
     return members - matmul(weights.T, d)
 

@@ -65,7 +65,7 @@ def fixed_point(
         mean = jnp.concatenate([moved, mean[n:]])
         return CovarianceState(time, mean, symmetric.congruence(F, cov) + symmetric.pack(Q))
 
-    def one(
+    def passed(
         state: CovarianceState, step: tuple[Measurement, Array]
     ) -> tuple[CovarianceState, None]:
         measurement, last = step
@@ -83,7 +83,7 @@ def fixed_point(
     # After the measurements once more, only to move on: a second copy would be compiled longer.
     steps = jax.tree.map(lambda x: jnp.concatenate([x, x[-1:]]), measurements)
     final = jnp.arange(steps.time.shape[0]) == measurements.time.shape[0]
-    last = lax.scan(one, first, (steps, final))[0]
+    last = lax.scan(passed, first, (steps, final))[0]
     cov = symmetric.unpack(last.cov)
     f = cholesky.factor(cov[:n, :n])
     root = cholesky.forward(f, cov[:n, n:])

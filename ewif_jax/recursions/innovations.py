@@ -31,14 +31,14 @@ def compared(model: Model, params: Any, mean: Array, measurement: Measurement) -
     return Compared(difference, H, R, measurement.mask)
 
 
-def unjudged(innovation: gaussian.Innovation, mask: Array) -> Info:
-    """The `Info` of an innovation that nobody refuses; the contract adds the rest."""
+def info_of(innovation: gaussian.Innovation, mask: Array, accepted: Array | bool = True) -> Info:
+    """The `Info` of a measurement taken to be in sequence; the contract adds the rest."""
     return Info(
         innovation.value,
         innovation.cov,
         gaussian.log_density(innovation, mask),
         jnp.zeros((), innovation.value.dtype),
-        jnp.int32(Status.USED),
+        jnp.where(accepted, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),
     )
 
 
@@ -73,6 +73,4 @@ def updated(
     its `Info` (delay 0, status USED or REJECTED)."""
     (difference, H, R, mask), good = sound(model, cov, seen)
     mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask, H_where)
-    info = unjudged(innovation, mask)
-    status = jnp.where(good, info.status, jnp.int32(Status.REJECTED))
-    return mean, cov, info._replace(status=status)
+    return mean, cov, info_of(innovation, mask, good)

@@ -10,8 +10,9 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model
 from ewif_jax.recursions import particles as form
+from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
-from ewif_jax.recursions.particles import Seen
+from ewif_jax.recursions.weighing import Seen
 from ewif_jax.types import Measurement
 
 BLOCK = 256
@@ -55,22 +56,22 @@ def lines(
     def follow(state: Lines, measurement: Measurement) -> Lines:
         key, first, second = jax.random.split(state.key, 3)
         _, ahead = form.moved(model, params, state.particles, first, state.time, measurement.time)
-        seen = form.look(model, params, ahead, state.log_weights, measurement)
+        seen = weighing.look(model, params, ahead, state.log_weights, measurement)
         moved = Lines(measurement.time, ahead, state.fixed, state.log_weights, key)
-        log_weights, _ = form.weigh(moved, seen, measurement, reachable=True)
+        log_weights, _ = weighing.weigh(moved, seen, measurement, reachable=True)
         (ahead, fixed), log_weights = form.refreshed(
             second, (ahead, state.fixed), log_weights, count / 2
         )
         return Lines(measurement.time, ahead, fixed, log_weights, key)
 
-    def one(state: Lines, measurement: Measurement) -> tuple[Lines, None]:
+    def passed(state: Lines, measurement: Measurement) -> tuple[Lines, None]:
         inside = (measurement.time > tau) & (measurement.time < now)
         inside = inside & jnp.any(measurement.mask)
         safe = measurement._replace(time=jnp.where(inside, measurement.time, state.time))
         return lax.cond(inside, follow, lambda state, _: state, state, safe), None
 
     state = Lines(tau, there, there, log_weights, key)
-    return lax.scan(one, state, measurements)[0]
+    return lax.scan(passed, state, measurements)[0]
 
 
 def look_back(
@@ -89,27 +90,31 @@ def look_back(
     """
     ahead = form.transported(model, params, last.particles, last.time, now)
     f = cholesky.factor(jnp.asarray(model.process_cov(params, last.time, now), ahead.dtype))
-    seen = form.look(model, params, last.fixed, last.log_weights, measurement)
+    found = weighing.compared(model, params, last.fixed, measurement)
+    line_density = weighing.log_density(found, measurement.mask)
+    line_weights = weighing.shares(last.log_weights, found.numbers)
+    origin = weighing.stand_in(model, params, found.numbers, last.fixed, line_weights, measurement)
+    offsets = weighing.about(model, origin, found.predicted, found.numbers, measurement)
     center = jnp.mean(ahead, 1, keepdims=True)
     targets, points = (cholesky.forward(f, x - center) for x in (ahead, state.particles))
-    best = jnp.max(seen.log_density)
+    best = jnp.max(line_density)
     best = jnp.where(best > -jnp.inf, best, 0)
-    density = jnp.exp(seen.log_density - best)
-    difference, _, R, _ = form.compared(model, params, last.fixed, measurement)
-    m = difference.shape[0]
-    squares = (difference[:, None] * difference[None]).reshape(m * m, -1)
-    columns = jnp.stack([jnp.ones_like(density), density, *difference, *squares], 1)
+    density = jnp.exp(line_density - best)
+    m = offsets.shape[0]
+    squares = (offsets[:, None] * offsets[None]).reshape(m * m, -1)
+    columns = jnp.stack([jnp.ones_like(density), density, *offsets, *squares], 1)
 
     def means(x: Array) -> Array:
         """Means of the columns over the lines, weighted by how well they lead to x (n,)."""
         log_weights = last.log_weights - 0.5 * jnp.sum(jnp.square(targets - x[:, None]), 0)
-        sums = jnp.exp(log_weights - jnp.max(log_weights)) @ columns
-        return sums / sums[0]
+        weighted = jnp.exp(log_weights - jnp.max(log_weights)) @ columns
+        return weighted / weighted[0]
 
-    found = lax.map(means, points.T, batch_size=BLOCK).T
-    possible = f.full_rank & (found[1] > 0)
-    log_density = jnp.where(possible, jnp.log(jnp.where(possible, found[1], 1)) + best, -jnp.inf)
+    sums = lax.map(means, points.T, batch_size=BLOCK).T
+    possible = f.full_rank & (sums[1] > 0)
+    log_density = jnp.where(possible, jnp.log(jnp.where(possible, sums[1], 1)) + best, -jnp.inf)
     w = jnp.exp(state.log_weights)[:, None]
-    innovation, square = (matmul(x, w)[:, 0] for x in (found[2 : 2 + m], found[2 + m :]))
-    outer = innovation[:, None] * innovation[None]
-    return Seen(log_density, innovation, R + square.reshape(m, m) - outer)
+    shift, square = (matmul(x, w)[:, 0] for x in (sums[2 : 2 + m], sums[2 + m :]))
+    innovation = weighing.innovation_of(model, origin, shift, found.numbers, measurement)
+    cov = found.R + square.reshape(m, m) - shift[:, None] * shift[None]
+    return Seen(log_density, innovation, weighing.judged(cov, found.numbers))

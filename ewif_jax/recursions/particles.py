@@ -1,4 +1,4 @@
-"""What particle filters share: drawing, moving, weighing and resampling a cloud of particles.
+"""What particle filters share: drawing, moving and resampling a cloud of particles.
 
 Particles are the last axis everywhere, so that what a model computes for one state becomes one
 operation on contiguous rows.
@@ -10,16 +10,13 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.special import logsumexp
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
-from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.resampling import Resampling, ancestors, effective_sample_size
 from ewif_jax.models import Model
-from ewif_jax.models.sensor_range import check_sensor
-from ewif_jax.recursions.contract import verdict
-from ewif_jax.types import Gaussian, Info, Measurement, Status
+from ewif_jax.types import Gaussian
 
 
 class ParticleState(NamedTuple):
@@ -40,15 +37,6 @@ class Cloud(NamedTuple):
     ess_threshold: float
 
 
-class Seen(NamedTuple):
-    """A measurement as the particles see it: log_density (N,) of it given each of them (-inf where
-    it is not a number), innovation (m,) and innovation_cov (m, m) given all of them."""
-
-    log_density: Array
-    innovation: Array
-    innovation_cov: Array
-
-
 State = TypeVar("State", bound=Any)
 """A NamedTuple that begins with the fields of `ParticleState`."""
 
@@ -57,8 +45,8 @@ def cloud(model: Model, particles: int, resampling: Resampling, ess_threshold: f
     """A `Cloud` of checked settings."""
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     checks.whole("particles", particles, 2)
-    known = resampling in ("systematic", "stratified")
-    checks.require(known, "resampling", "'systematic' or 'stratified'", repr(resampling))
+    offered = resampling in ("systematic", "stratified")
+    checks.require(offered, "resampling", "'systematic' or 'stratified'", repr(resampling))
     checks.at_least("ess_threshold", ess_threshold, 0.0)
     return Cloud(model, particles, resampling, ess_threshold)
 
@@ -132,13 +120,30 @@ def step_ahead(
     """The state at a later `time`, and what goes along with the particles (pytrees of arrays with
     the particles as the last axis), both resampled first if too few particles count."""
     key, first, second = jax.random.split(state.key, 3)
+    state, along = renewed(kind, first, state, along)
+    _, particles = moved(kind.model, params, state.particles, second, state.time, time)
+    return state._replace(time=time, particles=particles, key=key), along
+
+
+def renewed(kind: Cloud, key: Array, state: State, along: Any = ()) -> tuple[State, Any]:
+    """The state, and what goes along with its particles, resampled if too few of them count."""
     least = kind.ess_threshold * kind.particles
     (particles, along), log_weights = refreshed(
-        first, (state.particles, along), state.log_weights, least, kind.resampling
+        key, (state.particles, along), state.log_weights, least, kind.resampling
     )
-    _, particles = moved(kind.model, params, particles, second, state.time, time)
-    state = state._replace(time=time, particles=particles, log_weights=log_weights, key=key)
-    return state, along
+    return state._replace(particles=particles, log_weights=log_weights), along
+
+
+def ready_to_draw(kind: Cloud, state: State, along: Any = ()) -> tuple[State, Any, Array]:
+    """The state before new noise is drawn for a late measurement, what goes along with its
+    particles, and the key of that noise.
+
+    Copies are worth having where each draws its own noise, so a cloud that measurements at this
+    time have thinned out is resampled first. What was estimated before carries no noise of it.
+    """
+    key, ours = jax.random.split(state.key)
+    state, along = renewed(kind, jax.random.fold_in(ours, 1), state, along)
+    return state._replace(key=key), along, ours
 
 
 def refreshed(
@@ -171,48 +176,16 @@ def resampled(key: Array, cloud: Any, log_weights: Array, method: Resampling) ->
     return jax.tree.map(take, cloud), equal
 
 
-def look(
-    model: Model, params: Any, particles: Array, log_weights: Array, measurement: Measurement
-) -> Seen:
-    """The measurement as it is seen by particles (n, N) at its time.
-
-    A component without noise (singular R) cannot weigh particles: no density is a number then.
-    """
-    difference, numbers, R, f = compared(model, params, particles, measurement)
-    white = cholesky.forward(f, difference)
-    size = jnp.sum(measurement.mask).astype(white.dtype) * jnp.log(2 * jnp.pi)
-    log_density = -0.5 * (jnp.sum(jnp.square(white), 0) + size) - cholesky.half_log_det(f)
-    good = numbers & jnp.isfinite(log_density) & f.full_rank
-    weights = jnp.where(numbers, jnp.exp(log_weights), 0)
-    innovation, cov = moments(difference, weights)
-    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, R + cov)
-
-
-def compared(
-    model: Model, params: Any, particles: Array, measurement: Measurement
-) -> tuple[Array, Array, Array, cholesky.Factor]:
-    """Measured minus predicted (m, N), whether it and its square are numbers (N,) (else it is 0), R
-    and its factor; absent components have difference 0 and unit variance."""
-    time, value, sensor, mask = measurement
-    check_sensor(model, params, particles[:, 0], sensor, time)
-    R = jnp.asarray(model.measurement_cov(params, sensor, time), particles.dtype)
-    checks.shape("measurement.value", value, (R.shape[0],))
-
-    def compare(x: Array) -> Array:
-        predicted = jnp.asarray(model.observe(params, x, sensor, time), x.dtype)
-        return model.residual(value, predicted, sensor)
-
-    difference = jnp.where(mask[:, None], jax.vmap(compare, -1, -1)(particles), 0)
-    numbers = jnp.all(jnp.isfinite(jnp.square(difference)), 0)
-    R = gaussian.mask_cov(R, mask)
-    return jnp.where(numbers, difference, 0), numbers, R, cholesky.factor(R)
-
-
 def moments(x: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of x (n, N) under weights (N,) that sum to one."""
-    mean = matmul(x, weights[:, None])[:, 0]
-    spread = x - mean[:, None]
-    return mean, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
+    # About one particle: rounded weights do not sum to one, which far from the origin would count.
+    # Their sum has a derivative (see `resampled`), which goes with the whole of x.
+    total = jnp.sum(weights)
+    start = x[:, 0] * (1 + total - lax.stop_gradient(total))
+    apart = x - x[:, :1]
+    shift = matmul(apart, weights[:, None])[:, 0]
+    spread = apart - shift[:, None]
+    return start + shift, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
 
 
 def estimate(params: Any, state: Any) -> Gaussian:
@@ -224,47 +197,3 @@ def estimate(params: Any, state: Any) -> Gaussian:
 def summary(state: Any) -> Gaussian:
     """Weighted mean (n,) and covariance (n, n) of the particles."""
     return Gaussian(*moments(state.particles, jnp.exp(state.log_weights)))
-
-
-def weigh(
-    state: Any,
-    seen: Seen,
-    measurement: Measurement,
-    reachable: Array | bool,
-    collapse: float | None = None,
-) -> tuple[Array, Info]:
-    r"""Log weights :math:`\log w_i + \log p(z | x_i)`, normalised (N,), and the `Info`.
-
-    The log likelihood is the logarithm of the mean density under the old weights. The weights stay
-    as they were if no particle could have caused the measurement, or if it is late and leaves less
-    than 1 / `collapse` of the effective particles (`REJECTED`), and if it is late and not
-    `reachable` (`TOO_LATE`).
-    """
-    late = measurement.time < state.time
-    present = jnp.any(measurement.mask)
-    joint = state.log_weights + seen.log_density
-    kept = jnp.any(joint > -jnp.inf)
-    joint = jnp.where(kept, joint, state.log_weights)
-    evidence = logsumexp(joint)
-    log_weights = joint - evidence
-    if collapse is not None:
-        before, after = (effective_sample_size(w) for w in (state.log_weights, log_weights))
-        kept = kept & ~(late & (after * collapse < before))
-    reached = ~late | jnp.asarray(reachable)
-    used = present & kept & reached
-    status = verdict(late, kept, Status.LATE_USED)
-    status = jnp.where(kept, status, jnp.int32(Status.REJECTED))
-    status = jnp.where(reached, status, jnp.int32(Status.TOO_LATE))
-    info = Info(
-        seen.innovation,
-        seen.innovation_cov,
-        jnp.where(used, evidence, 0),
-        state.time - measurement.time,
-        jnp.where(present, status, jnp.int32(Status.MASKED)),
-    )
-    return jnp.where(used, log_weights, state.log_weights), info
-
-
-def was_used(info: Info) -> Array:
-    """Whether the measurement entered the estimate, () bool."""
-    return (info.status == Status.USED) | (info.status == Status.LATE_USED)

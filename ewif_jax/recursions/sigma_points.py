@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.linearise import predict_state
+from ewif_jax.models.linearise import patterns, predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
-from ewif_jax.recursions.innovations import Compared, updated
+from ewif_jax.recursions.innovations import Compared, info_of, numbers, updated
 from ewif_jax.types import Info, Measurement
 
 ROUNDING = 1e-4
@@ -42,10 +43,10 @@ def transform(points: SigmaPoints, params: Any, n: int, dtype: Any) -> Transform
     checks.positive("ut_alpha", ut_alpha)
     checks.finite("ut_beta", ut_beta)
     spread = ut_alpha**2 * (n + ut_kappa)
-    known = checks.known(spread)
-    if known is not None:
-        checks.require(known > 0, "ut_kappa", f"a number above -{n}, minus the states", ut_kappa)
-        lost = float(jnp.finfo(dtype).eps) * n / float(known)
+    number = checks.known(spread)
+    if number is not None:
+        checks.require(number > 0, "ut_kappa", f"a number above -{n}, minus the states", ut_kappa)
+        lost = float(jnp.finfo(dtype).eps) * n / float(number)
         checks.require(
             lost <= ROUNDING,
             "ut_alpha",
@@ -78,14 +79,25 @@ def flow_around(
 ) -> tuple[Array, Array, Array]:
     """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0: of
     all but the last `still` components, which do not move."""
-    if points is None:
+    if points is None or model.linear is not None:
         return predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
+    root = _root(cov, mean.shape[0] - still)
+    moved, line = _moved(model, points, params, mean, root.lower, t0, t1, still)
+    Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
+    return moved, sigma_points.slope_of(line, root), line.left_over + Q
 
-    def move(x: Array) -> Array:
-        return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    moved, F, left_over = _regressed(move, lambda x, y: x - y, points, params, mean, cov, still)
-    return moved, F, left_over + jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
+def move_around(
+    model: Model, points: SigmaPoints, params: Any, mean: Array, cov: Array, t0: Array, t1: Array
+) -> tuple[Array, Array]:
+    """Mean (n,) and packed covariance at t1 of a Gaussian at t0 with a packed `cov`."""
+    if model.linear is not None:
+        moved, F, Q = predict_state(model, params, mean, t0, t1)
+        return moved, symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
+    lower = _fine_root(cov, mean.shape[0])
+    moved, line = _moved(model, points, params, mean, lower, t0, t1)
+    Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
+    return moved, symmetric.pack(matmul(line.slope, line.slope.T) + line.left_over + Q)
 
 
 def measure_around(
@@ -98,21 +110,58 @@ def measure_around(
     still: int = 0,
 ) -> tuple[Array, Array, Info]:
     """`recursions.covariance.measure` with the measurement's moments by `points`."""
-    if points is None:
+    if points is None or model.linear is not None:
         return measure(model, params, mean, cov, measurement, still)
-    sensor = measurement.sensor
-    moving = mean[: mean.shape[0] - still]
-    see, R = view(model, params, sensor, measurement.time, moving)
+    n, sensor, mask = mean.shape[0] - still, measurement.sensor, measurement.mask
+    see, R = view(model, params, sensor, measurement.time, mean[:n])
 
     def apart(x: Array, y: Array) -> Array:
         return model.residual(x, y, sensor)
 
-    predicted, H, left_over = _regressed(see, apart, points, params, mean, cov, still)
+    root = _root(cov, n) if still else None
+    lower = _fine_root(cov, n) if root is None else root.lower
+    predicted, line = _regressed(see, apart, points, params, mean, lower, still)
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
-    difference = apart(measurement.value, predicted)
-    seen = Compared(difference, unseen(H, still), R + left_over, measurement.mask)
-    return updated(model, mean, cov, seen)
+    difference, R = apart(measurement.value, predicted), R + line.left_over
+    if root is not None:
+        H = unseen(sigma_points.slope_of(line, root), still)
+        return updated(model, mean, cov, Compared(difference, H, R, mask))
+    slope = jnp.where(mask[:, None], line.slope, 0)
+    good = numbers(difference, matmul(slope, slope.T) + R, mask)
+    difference, slope, R = (jnp.where(good, x, 0) for x in (difference, slope, R))
+    mask = mask & good
+    mean, cov, innovation = sigma_points.update(mean, lower, difference, slope, R, mask)
+    return mean, cov, info_of(innovation, mask, good)
+
+
+def _root(cov: Array, n: int) -> cholesky.Factor:
+    """The factor of the first n components' part of a packed `cov`, to be divided by."""
+    return cholesky.factor(symmetric.unpack(cov)[:n, :n])
+
+
+def _fine_root(cov: Array, n: int) -> Array:
+    """The factor's lower (n, n), not to be divided by: pivots near rounding are part of it, since a
+    position and a velocity of which little is known are correlated almost to one."""
+    return cholesky.factor(symmetric.unpack(cov), float(jnp.finfo(cov.dtype).eps)).lower
+
+
+def _moved(
+    model: Model,
+    points: SigmaPoints,
+    params: Any,
+    mean: Array,
+    lower: Array,
+    t0: Array,
+    t1: Array,
+    still: int = 0,
+) -> tuple[Array, sigma_points.Regression]:
+    """Mean at t1, and the motion as a straight line without its noise."""
+
+    def move(x: Array) -> Array:
+        return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
+
+    return _regressed(move, jnp.subtract, points, params, mean, lower, still)
 
 
 def _regressed(
@@ -121,20 +170,20 @@ def _regressed(
     points: SigmaPoints,
     params: Any,
     mean: Array,
-    cov: Array,
+    lower: Array,
     still: int,
-) -> tuple[Array, Array, Array]:
-    """Mean, slope and left-over covariance of f of all but the last `still` components of a
-    Gaussian. Values are compared through `apart` with the one at the mean, so that angles on both
-    sides of a cut have a mean. NaN, without harm to gradients, where a value is not a number.
+) -> tuple[Array, sigma_points.Regression]:
+    """Mean and straight line of f of all but the last `still` components of a Gaussian, whose
+    covariance has the factor `lower`. Values are compared through `apart` with the one at the mean,
+    so that angles on both sides of a cut have a mean. NaN, without harm to gradients, where a value
+    is not a number.
 
     The points that are moved along a column of the other components have f of the mean: they spread
     the rest, and each adds to what is left over as the central point does."""
     scale, centre = transform(points, params, mean.shape[0], mean.dtype)
     centre = centre + still / scale
-    n = mean.shape[0] - still
-    mean, root = mean[:n], cholesky.factor(symmetric.unpack(cov)[:n, :n])
-    around = mean[:, None] + sigma_points.offsets(root.lower, scale)
+    mean = mean[: mean.shape[0] - still]
+    around = mean[:, None] + sigma_points.offsets(lower, scale)
     middle = f(mean)
 
     def difference(x: Array) -> Array:
@@ -143,5 +192,6 @@ def _regressed(
     differences = jax.vmap(difference, in_axes=1, out_axes=1)(around)
     good = jnp.all(jnp.isfinite(differences))
     differences = jnp.where(good, differences, 0)
-    shift, slope, left_over = sigma_points.regression(differences, root, scale, centre)
-    return choose(good, (middle + shift, slope, left_over), (jnp.nan,) * 3)
+    line = sigma_points.regression(differences, scale, centre)
+    found = middle + line.shift, line
+    return choose(good, found, jax.tree.map(lambda _: jnp.nan, found))

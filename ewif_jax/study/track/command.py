@@ -72,7 +72,11 @@ def _followed(experiment, arguments, readings, tracks, counted, chosen):
     if arguments.tune:
         drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
         experiment.figure("tuning", drawn)
-    rows = [row for outcome in outcomes for row in _rows(outcome, chosen, counted, experiment.options.seed)]
+    rows = [
+        row
+        for outcome in outcomes
+        for row in _rows(outcome, chosen, counted, experiment.options.seed)
+    ]
     title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
     experiment.table("track", title, rows, [_statuses(tracks, outcomes[0])])
     experiment.finish()

@@ -1,0 +1,204 @@
+"""What particles make of a measurement: their densities, the innovation given all, new weights."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.scipy.special import logsumexp
+
+from ewif_jax import checks
+from ewif_jax.fast.small import matmul
+from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.kernels.resampling import effective_sample_size
+from ewif_jax.models import Model
+from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.particles import moments
+from ewif_jax.types import Info, Measurement, Status
+
+
+class Seen(NamedTuple):
+    """A measurement as the particles see it: log_density (N,) of it given each of them (-inf where
+    it is not a number), innovation (m,) and innovation_cov (m, m) given all of them: 0 and the
+    identity where none of them makes a number of it."""
+
+    log_density: Array
+    innovation: Array
+    innovation_cov: Array
+
+
+class Compared(NamedTuple):
+    """A measurement beside what each particle predicts: predicted (m, N), difference (m, N), 0
+    where it is absent or not a number, numbers (N,): where it and its square are numbers, R (m, m)
+    with unit variance where it is absent, and its factor."""
+
+    predicted: Array
+    difference: Array
+    numbers: Array
+    R: Array
+    factor: cholesky.Factor
+
+
+def within_reach(measurement: Measurement, reachable: Array | bool) -> Measurement:
+    """The measurement, or nothing where the filter cannot reach back to it."""
+    return measurement._replace(mask=measurement.mask & reachable)
+
+
+def look(
+    model: Model, params: Any, particles: Array, log_weights: Array, measurement: Measurement
+) -> Seen:
+    """The measurement as it is seen by particles (n, N) at its time.
+
+    A component without noise (singular R) cannot weigh particles: no density is a number then.
+    """
+    found = compared(model, params, particles, measurement)
+    density = log_density(found, measurement.mask)
+    innovation, spread = averaged(
+        model, params, particles, found.predicted, found.numbers, log_weights, measurement
+    )
+    cov = found.R + spread
+    return Seen(density, innovation, judged(cov, found.numbers))
+
+
+def averaged(
+    model: Model,
+    params: Any,
+    particles: Array,
+    predicted: Array,
+    numbers: Array,
+    log_weights: Array,
+    measurement: Measurement,
+) -> tuple[Array, Array]:
+    """The innovation (m,), and the covariance (m, m) of the predicted values (m, N), given all
+    particles (n, N) at the measurement's time."""
+    weights = shares(log_weights, numbers)
+    origin = stand_in(model, params, numbers, particles, weights, measurement)
+    offsets = about(model, origin, predicted, numbers, measurement)
+    shift, spread = moments(offsets, weights)
+    return innovation_of(model, origin, shift, numbers, measurement), spread
+
+
+def compared(model: Model, params: Any, particles: Array, measurement: Measurement) -> Compared:
+    """The measurement beside what particles (n, N) at its time predict."""
+    time, value, sensor, mask = measurement
+    check_sensor(model, params, particles[:, 0], sensor, time)
+    R = jnp.asarray(model.measurement_cov(params, sensor, time), particles.dtype)
+    checks.shape("measurement.value", value, (R.shape[0],))
+
+    def predict_value(x: Array) -> Array:
+        return jnp.asarray(model.observe(params, x, sensor, time), x.dtype)
+
+    predicted = jax.vmap(predict_value, -1, -1)(particles)
+    subtracted = jax.vmap(lambda seen: model.residual(value, seen, sensor), -1, -1)(predicted)
+    difference = jnp.where(mask[:, None], subtracted, 0)
+    numbers = jnp.all(jnp.isfinite(jnp.square(difference)), 0)
+    R = gaussian.mask_cov(R, mask)
+    difference = jnp.where(numbers, difference, 0)
+    return Compared(predicted, difference, numbers, R, cholesky.factor(R))
+
+
+def log_density(found: Compared, mask: Array) -> Array:
+    """log p(z | x) (N,), -inf where it is not a number."""
+    f = found.factor
+    white = cholesky.forward(f, found.difference)
+    size = jnp.sum(mask).astype(white.dtype) * jnp.log(jnp.asarray(2 * jnp.pi, white.dtype))
+    density = -0.5 * (jnp.sum(jnp.square(white), 0) + size) - cholesky.half_log_det(f)
+    good = found.numbers & jnp.isfinite(density) & f.full_rank
+    return jnp.where(good, density, -jnp.inf)
+
+
+def shares(log_weights: Array, numbers: Array) -> Array:
+    """The weights (N,) of those particles that make a number of a measurement, of sum one."""
+    weights = jnp.where(numbers, jnp.exp(log_weights), 0)
+    total = jnp.sum(weights)
+    return weights / jnp.where(total > 0, total, 1)
+
+
+def stand_in(
+    model: Model,
+    params: Any,
+    numbers: Array,
+    particles: Array,
+    weights: Array,
+    measurement: Measurement,
+) -> Array:
+    """A value (m,) amid those that the particles predict, from which these are counted: the one
+    predicted at the particles' mean, or what was measured where that is not a number.
+
+    Counted from there, predicted angles on both sides of a cut have a mean, and the innovation is
+    wrapped once, however far off it is. Nothing depends on the choice but the cut, so no derivative
+    goes through it.
+    """
+    middle = matmul(jnp.where(numbers, particles, 0), weights[:, None])[:, 0]
+    seen = model.observe(params, lax.stop_gradient(middle), measurement.sensor, measurement.time)
+    seen = lax.stop_gradient(jnp.asarray(seen, particles.dtype))
+    return jnp.where(jnp.isfinite(seen), seen, measurement.value)
+
+
+def about(
+    model: Model, origin: Array, predicted: Array, numbers: Array, measurement: Measurement
+) -> Array:
+    """The predicted values (m, N) less `origin`, 0 where they are absent or not a number."""
+    good = measurement.mask[:, None] & numbers[None]
+    safe = jnp.where(good, predicted, origin[:, None])
+    offsets = jax.vmap(lambda seen: model.residual(seen, origin, measurement.sensor), -1, -1)(safe)
+    return jnp.where(good, offsets, 0)
+
+
+def innovation_of(
+    model: Model, origin: Array, shift: Array, numbers: Array, measurement: Measurement
+) -> Array:
+    """Measured minus `origin + shift` (m,), wrapped once, 0 where it is absent or no particle makes
+    a number of it."""
+    difference = model.residual(measurement.value, origin + shift, measurement.sensor)
+    return jnp.where(measurement.mask & jnp.any(numbers), difference, 0)
+
+
+def judged(cov: Array, numbers: Array) -> Array:
+    """The innovation's covariance (m, m), the identity where no particle makes a number of it."""
+    return jnp.where(jnp.any(numbers), cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
+
+
+def weigh(
+    state: Any,
+    seen: Seen,
+    measurement: Measurement,
+    reachable: Array | bool,
+    collapse: float | None = None,
+) -> tuple[Array, Info]:
+    r"""Log weights :math:`\log w_i + \log p(z | x_i)`, normalised (N,), and the `Info`.
+
+    The log likelihood is the logarithm of the mean density under the old weights. The weights stay
+    as they were if no particle could have caused the measurement, or if it is late and leaves less
+    than 1 / `collapse` of the effective particles (`REJECTED`), and if it is late and not
+    `reachable` (`TOO_LATE`).
+    """
+    late = measurement.time < state.time
+    present = jnp.any(measurement.mask)
+    joint = state.log_weights + seen.log_density
+    kept = jnp.any(joint > -jnp.inf)
+    joint = jnp.where(kept, joint, state.log_weights)
+    evidence = logsumexp(joint)
+    log_weights = joint - evidence
+    if collapse is not None:
+        before, after = (effective_sample_size(w) for w in (state.log_weights, log_weights))
+        kept = kept & ~(late & (after * collapse < before))
+    reached = ~late | jnp.asarray(reachable)
+    used = present & kept & reached
+    status = verdict(late, kept, Status.LATE_USED)
+    status = jnp.where(kept, status, jnp.int32(Status.REJECTED))
+    status = jnp.where(reached, status, jnp.int32(Status.TOO_LATE))
+    info = Info(
+        seen.innovation,
+        seen.innovation_cov,
+        jnp.where(used, evidence, 0),
+        state.time - measurement.time,
+        jnp.where(present, status, jnp.int32(Status.MASKED)),
+    )
+    return jnp.where(used, log_weights, state.log_weights), info
+
+
+def was_used(info: Info) -> Array:
+    """Whether the measurement entered the estimate, () bool."""
+    return (info.status == Status.USED) | (info.status == Status.LATE_USED)
