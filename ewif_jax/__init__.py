@@ -7,7 +7,7 @@ rooms `analysis`, `continuous`, `losses`, `models`, `scenarios`, `scores`, `tran
 
 from importlib import import_module as _import_module
 from importlib.util import find_spec as _find_spec
-from types import ModuleType as _ModuleType
+from typing import TYPE_CHECKING as _TYPE_CHECKING
 from warnings import warn as _warn
 
 from ewif_jax import analysis, continuous, losses, models, scenarios, scores, transforms
@@ -190,22 +190,24 @@ _MOVED = {
 """Names that were here in the last release, and the room where they are now."""
 
 
-def __getattr__(name: str) -> _ModuleType | object:
-    if name in _MOVED:
-        there = f"{__name__}.{_MOVED[name]}"
-        _warn(
-            f"{__name__}.{name} is now {there}.{name}; the next release has the new name only",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(_import_module(there), name)
-    if name == "lab":
-        try:
-            return _import_module(f"{__name__}.lab")
-        except ModuleNotFoundError as error:
-            needed = "ewif_jax.lab needs what `pip install ewif_jax[lab]` installs"
-            raise ImportError(f"{needed} ({error})") from error
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not _TYPE_CHECKING:  # a checker shall say which names are not here
+
+    def __getattr__(name: str) -> object:
+        if name in _MOVED:
+            there = f"{__name__}.{_MOVED[name]}"
+            _warn(
+                f"{__name__}.{name} is now {there}.{name}; the next release has the new name only",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return getattr(_import_module(there), name)
+        if name == "lab":
+            try:
+                return _import_module(f"{__name__}.lab")
+            except ModuleNotFoundError as error:
+                needed = "ewif_jax.lab needs what `pip install ewif_jax[lab]` installs"
+                raise ImportError(f"{needed} ({error})") from error
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
