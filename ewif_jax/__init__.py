@@ -1,24 +1,25 @@
 """Differentiable filtering with late measurements in JAX.
 
 A model of the world (`linear_model`, `models`), an estimator (`ewif`, `kalman`, ...), and a stream
-of measurements in arrival order go into `run`; `monte_carlo` and `tune` build on it.
+of measurements in arrival order go into `run`; `monte_carlo` and `tune` build on it. More is in the
+rooms `analysis`, `continuous`, `losses`, `models`, `scenarios`, `scores`, `transforms` and `lab`.
 """
 
-from ewif_jax import losses, models, scenarios, scores, transforms
+from importlib import import_module as _import_module
+from importlib.util import find_spec as _find_spec
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from warnings import warn as _warn
+
+from ewif_jax import analysis, continuous, losses, models, scenarios, scores, transforms
 from ewif_jax.analysis.anderson import (
     actual_error,
-    error_bounds,
     steady_state,
-    weighted_covariances,
-    weighting_as_process_noise,
 )
-from ewif_jax.analysis.anderson_continuous import steady_state_continuous, weighting_as_input_noise
-from ewif_jax.analysis.consistency import chi2_band, nees, nis, rmse
+from ewif_jax.analysis.consistency import nees, nis, rmse
 from ewif_jax.analysis.crlb import crlb
-from ewif_jax.analysis.equivalence import Case, equivalent_process_noise, equivalent_tau
+from ewif_jax.analysis.equivalence import equivalent_process_noise, equivalent_tau
 from ewif_jax.analysis.expected import expected_mse
 from ewif_jax.analysis.merit import (
-    alpha_beta_eigenvalues,
     alpha_beta_gains,
     cutoff_delay,
     delayed_gain,
@@ -28,11 +29,9 @@ from ewif_jax.analysis.merit import (
     random_walk_gain,
     steady_state_gain,
 )
-from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
-from ewif_jax.analysis.stability import spectral_abscissa, spectral_radius
+from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_late
 from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
-from ewif_jax.continuous.error import actual_error_continuous, error_bounds_continuous
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
 from ewif_jax.estimator import run, step
 from ewif_jax.estimators.bootstrap import bootstrap
@@ -77,19 +76,17 @@ from ewif_jax.oosm.replay import replay
 from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
 from ewif_jax.parallel import run_parallel
-from ewif_jax.recursions.ensembles import fuse_ensembles
 from ewif_jax.smoothers.batch_wls import batch_wls
 from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
 from ewif_jax.smoothers.rts import rts
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
 from ewif_jax.streams import stream
-from ewif_jax.transforms import Transform, positive, psd, unconstrained
+from ewif_jax.transforms import Transform
 from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 __all__ = [
-    "Case",
     "Estimator",
     "Gaussian",
     "Info",
@@ -105,16 +102,15 @@ __all__ = [
     "Tuned",
     "a1",
     "actual_error",
-    "actual_error_continuous",
     "al1",
-    "alpha_beta_eigenvalues",
     "alpha_beta_gains",
+    "analysis",
     "asd",
     "b1",
     "batch_wls",
     "bl1",
     "bootstrap",
-    "chi2_band",
+    "continuous",
     "crlb",
     "cutoff_delay",
     "delayed_gain",
@@ -124,15 +120,12 @@ __all__ = [
     "ensemble",
     "equivalent_process_noise",
     "equivalent_tau",
-    "error_bounds",
-    "error_bounds_continuous",
     "ewif",
     "expected_mse",
     "extended",
     "fading",
     "fixed_lag",
     "fixed_lag_ewif",
-    "fuse_ensembles",
     "gain_history",
     "information",
     "kalman",
@@ -150,15 +143,12 @@ __all__ = [
     "nis",
     "nis_loss",
     "pcrlb",
-    "pcrlb_equivalent",
     "pcrlb_late",
     "pf_extended",
     "pf_fixed_point",
     "pf_retrodict",
-    "positive",
     "prediction_loss",
     "prepare_cpu",
-    "psd",
     "random_walk_cutoff",
     "random_walk_gain",
     "replay",
@@ -174,11 +164,8 @@ __all__ = [
     "scores",
     "selective",
     "simulate_batch",
-    "spectral_abscissa",
-    "spectral_radius",
     "square_root",
     "steady_state",
-    "steady_state_continuous",
     "steady_state_gain",
     "step",
     "storage",
@@ -186,9 +173,53 @@ __all__ = [
     "transforms",
     "tune",
     "two_sided_ewif",
-    "unconstrained",
     "unscented",
-    "weighted_covariances",
-    "weighting_as_input_noise",
-    "weighting_as_process_noise",
 ]
+
+_MOVED = {
+    "Case": "analysis",
+    "actual_error_continuous": "continuous",
+    "alpha_beta_eigenvalues": "analysis",
+    "chi2_band": "analysis",
+    "error_bounds": "analysis",
+    "error_bounds_continuous": "continuous",
+    "fuse_ensembles": "analysis",
+    "pcrlb_equivalent": "analysis",
+    "positive": "transforms",
+    "psd": "transforms",
+    "spectral_abscissa": "analysis",
+    "spectral_radius": "analysis",
+    "steady_state_continuous": "continuous",
+    "unconstrained": "transforms",
+    "weighted_covariances": "analysis",
+    "weighting_as_input_noise": "continuous",
+    "weighting_as_process_noise": "analysis",
+}
+"""Names that were here in the last release, and the room where they are now."""
+
+
+if not _TYPE_CHECKING:  # a checker shall say which names are not here
+
+    def __getattr__(name: str) -> object:
+        if name in _MOVED:
+            there = f"{__name__}.{_MOVED[name]}"
+            _warn(
+                f"{__name__}.{name} is now {there}.{name}; the next release has the new name only",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return getattr(_import_module(there), name)
+        if name == "lab":
+            try:
+                return _import_module(f"{__name__}.lab")
+            except ModuleNotFoundError as error:
+                needed = "ewif_jax.lab needs what `pip install ewif_jax[lab]` installs"
+                raise ImportError(f"{needed} ({error})") from error
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    # Rooms that are not public would be offered too: importing a module leaves its name here. The
+    # laboratory is offered where it can be had: completion asks for whatever is offered.
+    lab = ["lab"] if _find_spec(f"{__name__}.lab") is not None else []
+    return [*__all__, *lab, *(name for name in globals() if name.startswith("__"))]

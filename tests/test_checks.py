@@ -382,7 +382,7 @@ REFUSED = {
         "ratio: expected a number between 0 and 1, got 1.0",
     ),
     "a negative index": (
-        lambda: ej.alpha_beta_eigenvalues(-1.0),
+        lambda: ej.analysis.alpha_beta_eigenvalues(-1.0),
         "index: expected a number >= 0.0, got -1.0",
     ),
     "a first covariance that is not PSD": (
@@ -403,7 +403,7 @@ REFUSED = {
         "system.R[1]: expected a positive semidefinite matrix, got smallest eigenvalue -2",
     ),
     "cov0 not PSD, weighted": (
-        lambda: ej.weighted_covariances(SYSTEM, NOT_PSD, fading=1.1, steps=3),
+        lambda: ej.analysis.weighted_covariances(SYSTEM, NOT_PSD, fading=1.1, steps=3),
         "cov0: expected a positive semidefinite matrix, got smallest eigenvalue -1",
     ),
     "H of another width, weighted": (
@@ -415,15 +415,15 @@ REFUSED = {
         "system.F: expected shape (3, 2, 2), got shape (2, 2, 2)",
     ),
     "no steps, weighted": (
-        lambda: ej.weighted_covariances(SYSTEM, SQUARE, fading=1.1, steps=0),
+        lambda: ej.analysis.weighted_covariances(SYSTEM, SQUARE, fading=1.1, steps=0),
         "steps: expected a whole number >= 1, got 0",
     ),
     "fading of another length": (
-        lambda: ej.weighted_covariances(SYSTEM, SQUARE, fading=np.ones(2), steps=3),
+        lambda: ej.analysis.weighted_covariances(SYSTEM, SQUARE, fading=np.ones(2), steps=3),
         "fading: expected shape (3,), got shape (2,)",
     ),
     "cov0 not PSD, bounds": (
-        lambda: ej.error_bounds(SYSTEM, NOT_PSD, fading=1.1, steps=3),
+        lambda: ej.analysis.error_bounds(SYSTEM, NOT_PSD, fading=1.1, steps=3),
         "cov0: expected a positive semidefinite matrix",
     ),
     "a gain of another size": (
@@ -445,28 +445,28 @@ REFUSED = {
         "system.R: expected a positive definite matrix, got smallest eigenvalue 0",
     ),
     "fading < 1, as noise": (
-        lambda: ej.weighting_as_process_noise(SQUARE, SQUARE, SQUARE, 0.9),
+        lambda: ej.analysis.weighting_as_process_noise(SQUARE, SQUARE, SQUARE, 0.9),
         "fading: expected a number >= 1.0, got 0.9",
     ),
     "a covariance that is not one, as noise": (
-        lambda: ej.weighting_as_process_noise(SQUARE, SQUARE, NOT_PSD, 1.1),
+        lambda: ej.analysis.weighting_as_process_noise(SQUARE, SQUARE, NOT_PSD, 1.1),
         "cov: expected a positive semidefinite matrix",
     ),
     # Anderson, continuous
     "a rate < 0, as noise": (
-        lambda: ej.weighting_as_input_noise(SQUARE, SQUARE, -0.1),
+        lambda: ej.continuous.weighting_as_input_noise(SQUARE, SQUARE, -0.1),
         "fading_rate: expected a number >= 0.0, got -0.1",
     ),
     "noise of another size, as noise": (
-        lambda: ej.weighting_as_input_noise(np.eye(3), SQUARE, 0.1),
+        lambda: ej.continuous.weighting_as_input_noise(np.eye(3), SQUARE, 0.1),
         "noise: expected shape (2, 2), got shape (3, 3)",
     ),
     "R < 0, steady and continuous": (
-        lambda: ej.steady_state_continuous(FLOW._replace(R=-np.eye(1))),
+        lambda: ej.continuous.steady_state_continuous(FLOW._replace(R=-np.eye(1))),
         "system.R: expected a positive definite matrix, got smallest eigenvalue -1",
     ),
     "a function, steady and continuous": (
-        lambda: ej.steady_state_continuous(FLOW._replace(F=lambda p, t: SQUARE)),
+        lambda: ej.continuous.steady_state_continuous(FLOW._replace(F=lambda p, t: SQUARE)),
         "system.F: expected a constant matrix, got a function",
     ),
     "F of another size, continuous": (
@@ -507,17 +507,19 @@ REFUSED = {
     ),
     "no tolerance": (lambda: bucy(rtol=0.0), "rtol: expected a positive number, got 0.0"),
     "cov0 not PSD, continuous": (
-        lambda: ej.actual_error_continuous(FLOW, None, NOT_PSD, times=[0.0, 1.0]),
+        lambda: ej.continuous.actual_error_continuous(FLOW, None, NOT_PSD, times=[0.0, 1.0]),
         "cov0: expected a positive semidefinite matrix, got smallest eigenvalue -1",
     ),
     "a truth of another size": (
-        lambda: ej.actual_error_continuous(
+        lambda: ej.continuous.actual_error_continuous(
             FLOW, None, SQUARE, times=np.array([0.0, 1.0]), truth=FLOW._replace(F=np.eye(3))
         ),
         "truth.F: expected shape (2, 2), got shape (3, 3)",
     ),
     "times that do not increase, continuous": (
-        lambda: ej.error_bounds_continuous(FLOW, None, SQUARE, times=np.array([1.0, 1.0])),
+        lambda: ej.continuous.error_bounds_continuous(
+            FLOW, None, SQUARE, times=np.array([1.0, 1.0])
+        ),
         "times: expected at least two increasing times, got [1. 1.]",
     ),
     # delays
@@ -537,7 +539,7 @@ REFUSED = {
 
 
 def weighted(**fields):
-    return ej.weighted_covariances(SYSTEM._replace(**fields), SQUARE, fading=1.1, steps=3)
+    return ej.analysis.weighted_covariances(SYSTEM._replace(**fields), SQUARE, fading=1.1, steps=3)
 
 
 def bucy(signal=None, fading_rate=0.0, rtol=None, **fields):

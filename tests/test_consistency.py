@@ -53,13 +53,13 @@ def test_nis_is_the_quadratic_form_of_the_innovations_that_are_present():
 def test_the_band_is_that_of_scipy(dof, samples, level):
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
     expected = stats.chi2.ppf(tails, dof * samples) / samples
-    np.testing.assert_allclose(ej.chi2_band(dof, samples, level), expected, rtol=1e-6)
+    np.testing.assert_allclose(ej.analysis.chi2_band(dof, samples, level), expected, rtol=1e-6)
 
 
 def test_the_band_holds_what_it_should():
     rng = np.random.default_rng(2)
     means = rng.chisquare(2, (4000, 25)).mean(1)
-    low, high = ej.chi2_band(2, 25, 0.9)
+    low, high = ej.analysis.chi2_band(2, 25, 0.9)
     share = ((means > low) & (means < high)).mean()
     assert abs(share - 0.9) < 4 * np.sqrt(0.09 / 4000)
 
@@ -69,4 +69,4 @@ def test_the_band_holds_what_it_should():
 )
 def test_what_is_refused(given, name):
     with pytest.raises(ValueError, match=f"{name}: expected"):
-        ej.chi2_band(*given)
+        ej.analysis.chi2_band(*given)

@@ -149,28 +149,32 @@ class Closure:
         return jnp.asarray(self.table) * params["c"][0]
 
 
+def filtered(entry, H, params):
+    model = ej.linear_model(np.eye(1), H, np.eye(1))
+    setting = {"prior": PRIOR, "t0": 0.0}
+    if entry == "run":
+        ej.run(ej.kalman(model), params, STREAM, **setting)
+    elif entry == "run_batch":
+        batch = STREAM._replace(value=jnp.zeros((2, 3, 1)))
+        ej.run_batch(ej.kalman(model), params, batch, **setting)
+    else:
+        other = STREAM._replace(sensor=jnp.ones(3, jnp.int32))
+        table = ej.linear_model(np.eye(1), lambda p, s, t: H(p, s, t)[None][s], np.eye(1))
+        with pytest.raises(ValueError, match=r"measurement\.sensor"):
+            ej.run(ej.kalman(table), params, other, **setting)
+
+
 @pytest.mark.parametrize("entry", ["run", "run_batch", "looked up"])
 def test_the_memo_keeps_neither_parameters_nor_functions(entry):
     H = Closure()
     params = {"c": jnp.ones(10_000)}
     gone = [weakref.ref(H), weakref.ref(params["c"])]
-    model = ej.linear_model(np.eye(1), H, np.eye(1))
-    setting = {"prior": PRIOR, "t0": 0.0}
-    batch = STREAM._replace(value=jnp.zeros((2, 3, 1)))
     before = len(memo.ANSWERS)
-    if entry == "run":
-        ej.run(ej.kalman(model), params, STREAM, **setting)
-    elif entry == "run_batch":
-        ej.run_batch(ej.kalman(model), params, batch, **setting)
-    else:
-        looked_up = STREAM._replace(sensor=jnp.ones(3, jnp.int32))
-        model = ej.linear_model(np.eye(1), lambda p, s, t: H(p, s, t)[None][s], np.eye(1))  # noqa: F821
-        with pytest.raises(ValueError, match=r"measurement\.sensor"):
-            ej.run(ej.kalman(model), params, looked_up, **setting)
+    filtered(entry, H, params)
     assert len(memo.ANSWERS) > before
     questions = [str(question) for question in memo.ANSWERS._answers]
     assert max(map(len, questions)) < 20_000  # of 80,000 bytes
-    del H, params, model, batch
+    del H, params
     jax.clear_caches()
     gc.collect()
     assert [was() is None for was in gone] == [True, True]

@@ -147,7 +147,11 @@ def test_an_infinite_gradient_leaves_the_parameters():
         return jnp.where(p["x"] < 2.5, jnp.inf * p["x"], (p["x"] - 1.0) ** 2)
 
     tuned = ej.tune(
-        loss, {"x": 3.0}, steps=50, optimizer=optax.sgd(0.1), transforms=ej.unconstrained()
+        loss,
+        {"x": 3.0},
+        steps=50,
+        optimizer=optax.sgd(0.1),
+        transforms=ej.transforms.unconstrained(),
     )
     assert np.isfinite(tuned.params["x"])
 
@@ -156,7 +160,7 @@ def test_an_infinite_gradient_leaves_the_parameters():
     ("change", "message"),
     [
         ({"steps": 0}, "steps: expected a whole number >= 1, got 0"),
-        ({"params": {"x": -1.0}, "transforms": {"x": ej.positive()}}, "params.*hold"),
+        ({"params": {"x": -1.0}, "transforms": {"x": ej.transforms.positive()}}, "params.*hold"),
         ({"loss": lambda p: p["x"] * jnp.nan}, "loss: expected a finite number"),
     ],
 )

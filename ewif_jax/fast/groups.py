@@ -1,7 +1,6 @@
-"""Runs a few at a time: how many, and where a group puts what it shows."""
+"""Runs a few at a time: how many."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,129 +9,53 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax.fast.batched import turned_rows
+from ewif_jax.fast.blocks import Place, Portion, like, rows, unrolled
 from ewif_jax.fast.compiling import WHOLE_LOOPS_BELOW, loops_are_joined
 from ewif_jax.fast.dependence import Traced
 from ewif_jax.fast.layout import joined, parted, runs_last
 
 
-class Portion(NamedTuple):
-    """What is done at once."""
+class Sizes(NamedTuple):
+    """What groups of runs and blocks of steps are made to fit on a CPU.
 
-    runs: int
-    steps: int
-    together: bool
-    """Whether the loop over the steps will be one function."""
-
-
-class Place(NamedTuple):
-    """Where a group of runs puts what it shows: whole, arrays (R, numbers of all steps), from row
-    () on."""
-
-    whole: Any
-    row: Array | int
-    known: Array | int
-    """How many of its first rows the group before has put there already."""
-
-
-def scan_in_blocks(
-    step: Callable[[Any, Any], tuple[Any, Any]],
-    state: Any,
-    arrivals: Any,
-    finish: Callable[[Any], Any],
-    portion: Portion,
-    place: Place | None,
-) -> tuple[Any, Any]:
-    """`lax.scan` of `step`, and `finish` of what it stacks: `finish` moves the stacked axis from
-    the front to place 1. Without a place for it the result has one of its own.
-
-    The stack is finished a block of steps at a time, while it is in the cache, and put where it
-    belongs, as long rows: short ones are copied slowly. The portion's steps divide all steps.
+    Found by measuring on two cores with jax 0.10.2: `README.md` has the times.
     """
-    steps, block = jax.tree.leaves(arrivals)[0].shape[0], portion.steps
-    if block == steps and place is None:
-        state, seen = lax.scan(step, state, arrivals)
-        return finish(seen), state
-    numbered = jnp.arange(steps), arrivals
-    blocks = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), numbered)
 
-    def numbered_step(state: Any, numbered: Any) -> tuple[Any, Any]:
-        k, arrival = numbered
-        if portion.together:  # otherwise several threads would take part in reading from the whole
-            whole = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), arrivals)
-            arrival = jax.tree.map(like, arrival, whole)
-        return step(state, arrival)
-
-    @partial(jax.checkpoint, prevent_cse=False)
-    def several(state: Any, numbered: Any) -> tuple[Any, Any]:
-        state, seen = lax.scan(numbered_step, state, numbered)
-        return state, finish(seen)
-
-    first = jax.tree.map(lambda x: x[0], blocks)
-    shapes = jax.eval_shape(several, state, first)[1]
-    shapes = jax.tree.map(lambda x: x.update(shape=(len(x), steps, *x.shape[2:])), shapes)
-    whole, row, known = (rows(shapes), 0, 0) if place is None else place
-
-    def put(carry: Any, numbered: Any) -> tuple[Any, None]:
-        state, whole = carry
-        number, some = numbered
-        state, seen = several(state, some)
-
-        def put_one(whole: Array, new: Array) -> Array:
-            flat = new.reshape(len(new), -1)
-            return _placed(whole, flat, jnp.stack([row, number * flat.shape[1]]), known)
-
-        return (state, jax.tree.map(put_one, whole, seen)), None
-
-    (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), blocks))
-    return (unrolled(whole, shapes) if place is None else whole), state
+    first_cache: int = 2**15
+    """Bytes. Where a loop is one function, the states of a group stay in it."""
+    second_cache: int = 2**19
+    """Bytes. Elsewhere they stay in this one: a shorter vector costs more than a slower cache."""
+    undivided: int = 2**18
+    """Bytes of an array from which on XLA has several threads share a loop, and wait at every
+    step: no array of a group is larger."""
+    line: int = 64
+    """Bytes of a cache line; a group is an odd number of them wide."""
+    shown: int = 200_000
+    """Bytes of what a block of short steps shows, which the second cache still holds."""
+    fewest: int = 16
+    """Runs. Where fewer would fit, one by one is faster: so large a state is a vector itself."""
+    fewest_drawn: int = 32
+    """The same of states with random members."""
+    narrowest: int = 128
+    """Runs of a group for the first cache, at least."""
+    narrowest_together: int = 112
+    """The same where steps are short, which keep about three times their state besides."""
+    widest: int = 256
+    """Runs of a group for the first cache, at most."""
+    shortest_block: int = 5
+    """Steps: with fewer, rows are copied so short that all steps at once are better."""
+    block: int = 20
+    """Steps of a block."""
+    longest_block: int = 100
+    """Steps of a block of short steps."""
+    short_step: int = 1000
+    """Numbers that a step computes of one run: fewer, and its loop over a group will be one
+    function (a group of a hundred runs stays below `compiling.WHOLE_LOOPS_BELOW`)."""
+    even_lines: float = 1.25
+    """How much longer a run takes in a group of an even number of lines."""
 
 
-def like(part: Array, same: Array) -> Array:
-    """`part` of an array, read from the whole as `same`, which saves a copy of the part; but its
-    slopes are those of the part: what is read from a whole adds slopes to all of it."""
-    floats = jnp.issubdtype(part.dtype, jnp.floating)
-    return _like(part, lax.stop_gradient(same)) if floats else same
-
-
-@jax.custom_jvp
-def _like(part: Array, same: Array) -> Array:
-    del part
-    return same
-
-
-@_like.defjvp
-def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return primals[1], tangents[0]
-
-
-@jax.custom_jvp
-def _placed(whole: Array, new: Array, at: Array, known: Array | int) -> Array:
-    """`new` in its place in `whole`, which has zeros there, but for `known` first rows of `new`."""
-    del known
-    return lax.dynamic_update_slice(whole, new, tuple(at))
-
-
-@_placed.defjvp
-def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """Slopes are added, not put. The transpose of adding leaves the whole as it is; that of putting
-    clears it in the place, for which the compiler copies the whole, each time."""
-    whole, new, at, known = primals
-    fresh = jnp.arange(len(new))[:, None] >= known
-    numbers = lax.ScatterDimensionNumbers((0, 1), (), (0, 1))
-    slope = lax.scatter_add(
-        tangents[0], at, jnp.where(fresh, tangents[1], 0), numbers, unique_indices=True
-    )
-    return _placed(whole, new, at, known), slope
-
-
-def rows(shapes: Any) -> Any:
-    """Zeros for what is to be shown, (R, T, ...), a row for each run."""
-    return jax.tree.map(lambda x: jnp.zeros((x.shape[0], x.size // x.shape[0]), x.dtype), shapes)
-
-
-def unrolled(whole: Any, shapes: Any) -> Any:
-    """What is shown, (R, T, ...), from a row for each run."""
-    return jax.tree.map(lambda x, shape: x.reshape(shape.shape), whole, shapes)
+SIZES = Sizes()
 
 
 def block_size(steps: int, shown: int, together: bool) -> int:
@@ -145,9 +68,10 @@ def block_size(steps: int, shown: int, together: bool) -> int:
         shown: bytes of what one step shows, of all runs that are filtered at once.
         together: whether steps are so short that their loop will be one function.
     """
-    most = min(max(_BLOCK // max(shown, 1), 20), 100) if together else 20
+    short = max(SIZES.shown // max(shown, 1), SIZES.block)
+    most = min(short, SIZES.longest_block) if together else SIZES.block
     best = max(d for d in range(1, min(most, steps) + 1) if steps % d == 0)
-    return best if best >= 5 else steps
+    return best if best >= SIZES.shortest_block else steps
 
 
 def group_size(
@@ -178,12 +102,15 @@ def group_size(
     """
     if jax.default_backend() != "cpu":
         return runs
-    room = max(min(_SECOND_CACHE // max(own + shared, 1), _UNDIVIDED // max(largest, 1)), 1)
+    room = max(
+        min(SIZES.second_cache // max(own + shared, 1), SIZES.undivided // max(largest, 1)), 1
+    )
     if own > shared and loops_are_joined():
         # A short step computes about as much again, three times.
-        least = max(_FIRST_CACHE // (4 * own), 112) if together else max(_FIRST_CACHE // own, 128)
-        room = min(room, least, 256)
-    if room < (32 if draws else min(runs, 16)):
+        fits = SIZES.first_cache // (4 * own if together else own)
+        least = max(fits, SIZES.narrowest_together if together else SIZES.narrowest)
+        room = min(room, least, SIZES.widest)
+    if room < (SIZES.fewest_drawn if draws else min(runs, SIZES.fewest)):
         return 1
     fewest = -(-runs // room)
     sizes = [_odd_lines(-(-runs // groups), itemsize) for groups in range(fewest, 2 * fewest + 2)]
@@ -195,18 +122,18 @@ def group_size(
 def _may_fail(size: int) -> bool:
     """Whether a loop that reads and writes so many bytes might be compiled as one function, though
     several threads would take part in that, which fails."""
-    return _UNDIVIDED // 2 <= size < WHOLE_LOOPS_BELOW // 2
+    return SIZES.undivided // 2 <= size < WHOLE_LOOPS_BELOW // 2
 
 
 def goes_together(step: Traced) -> bool:
     """Whether the loop over such steps, of about a hundred runs, will be one function."""
     numbers = sum(v.aval.size for eqn in step.closed.jaxpr.eqns for v in eqn.outvars)
-    return loops_are_joined() and numbers < 1000
+    return loops_are_joined() and numbers < SIZES.short_step
 
 
 def _odd_lines(size: int, itemsize: int) -> int:
     """The next size of a vector that is an odd number of cache lines."""
-    line = _LINE // itemsize
+    line = SIZES.line // itemsize
     lines = -(-size // line)
     return (lines + 1 - lines % 2) * line
 
@@ -214,11 +141,8 @@ def _odd_lines(size: int, itemsize: int) -> int:
 def _work(runs: int, size: int, itemsize: int) -> float:
     """Rows of an odd number of lines come to lie in all sets of a cache, others in each other's
     way: with rows of a power of two a transpose takes ten times as long."""
-    lines = size * itemsize / _LINE
-    return -(-runs // size) * size * (1 if lines % 2 == 1 else 1.25)
-
-
-_FIRST_CACHE, _SECOND_CACHE, _BLOCK, _UNDIVIDED, _LINE = 2**15, 2**19, 200_000, 2**18, 64
+    lines = size * itemsize / SIZES.line
+    return -(-runs // size) * size * (1 if lines % 2 == 1 else SIZES.even_lines)
 
 
 def in_groups(

@@ -138,7 +138,7 @@ def device_count(runs: int, devices: int | None) -> int:
 
 def broadcast_prefix(prefix: Any, tree: Any) -> Any:
     """A pytree of bools like `tree` from a prefix of it."""
-    return jax.tree.map(lambda f, sub: jax.tree.map(lambda _: bool(f), sub), prefix, tree)
+    return jax.tree.map(bool, jax.tree.broadcast(prefix, tree))
 
 
 class Frozen:

@@ -8,15 +8,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ewif_jax.fast.blocks import Place, Portion, scan_in_blocks
 from ewif_jax.fast.dependence import Divided, Traced, dependence, divided, traced
 from ewif_jax.fast.groups import (
-    Place,
-    Portion,
     block_size,
     goes_together,
     group_size,
     in_groups,
-    scan_in_blocks,
 )
 from ewif_jax.fast.layout import (
     joined,
@@ -37,6 +35,42 @@ class Loop(NamedTuple):
     """(params, state, arrival) -> state, what is observed of it."""
 
 
+class Inputs(NamedTuple):
+    """What goes into the runs; or, in the same places, which leaves have a leading axis of runs."""
+
+    params: Any
+    measurements: Any
+    prior: Any
+    times: Any
+    keys: Any
+    context: Any
+
+    @property
+    def first(self) -> tuple[Any, Any, Any]:
+        """What the first state is made of."""
+        return self.params, self.prior, self.keys
+
+    @property
+    def arrivals(self) -> tuple[Any, Any, Any]:
+        """What arrives, stacked over the steps."""
+        return self.measurements, self.times, self.context
+
+
+class OneRun(NamedTuple):
+    """The loop of one run as equations, and which leaves of its states, and of what is observed,
+    differ by run."""
+
+    start: Traced
+    step: Traced
+    state_differs: Any
+    seen_differs: Any
+
+    @property
+    def differ(self) -> tuple[Any, Any]:
+        """Both."""
+        return self.state_differs, self.seen_differs
+
+
 def over_runs(
     loop: Loop, estimate: Callable[[Any, Any], Any], inputs: Any, flags: Any
 ) -> tuple[Any, Any]:
@@ -45,35 +79,52 @@ def over_runs(
     Args:
         loop: of one run.
         estimate: (params, state) -> estimate, for its size.
-        inputs: params, measurements, prior, times, keys, context.
+        inputs: the fields of `Inputs`.
         flags: which of their leaves have a leading axis of runs.
     """
-    params, measurements, prior, times, key, context = jax.eval_shape(
-        lambda inputs: one_run(inputs, flags), inputs
+    inputs, per_run = Inputs(*inputs), Inputs(*flags)
+    single = jax.eval_shape(lambda inputs: one_run(inputs, per_run), inputs)
+    run = _traced_run(loop, single, per_run)
+    levels = (
+        _levels(per_run.params, 0),
+        _levels(run.state_differs, 1),
+        _levels(per_run.arrivals, 1),
     )
-    params_f, measurements_f, prior_f, times_f, key_f, context_f = flags
-    start = traced(loop.start, params, prior, key)
-    state, state_f = start.outputs, dependence(start, (params_f, prior_f, key_f))
-    arrival = jax.eval_shape(_first, (measurements, times, context))
-    arrival_f = measurements_f, times_f, context_f
-    step = traced(loop.step, params, state, arrival)
-    differ = _that_differ(step, params_f, state_f, arrival_f)
-    levels = _levels(params_f, 0), _levels(differ[0], 1), _levels(arrival_f, 1)
-    parts = divided(step, levels, differ)
-    runs, steps, m = inputs[1].value.shape
-    dtype = inputs[1].value.dtype
-    ahead = 0 < parts.needed <= runs * m * dtype.itemsize  # no more memory than the values
-    own, shared, largest = _sizes(state, differ[0], jax.eval_shape(estimate, params, state))
-    of_key = dependence(start, (_alike(params_f), _alike(prior_f), key_f))
+    parts = divided(run.step, levels, run.differ)
+    runs, _, m = inputs.measurements.value.shape
+    # What all share is stored for every arrival: only if that takes no more than the values do.
+    ahead = 0 < parts.needed <= runs * m * inputs.measurements.value.dtype.itemsize
+    shown = jax.eval_shape(estimate, single.params, run.start.outputs)
+    portion = _portion_of(run, shown, per_run, inputs.measurements.value, ahead)
+    if ahead and 1 < portion.runs < runs:
+        return _shared_ahead(loop, parts, inputs, per_run, run.differ, portion)
+    return _in_groups(loop, inputs, per_run, run.differ, portion)
+
+
+def _traced_run(loop: Loop, single: Inputs, per_run: Inputs) -> OneRun:
+    start = traced(loop.start, *single.first)
+    arrival = jax.eval_shape(_first, single.arrivals)
+    step = traced(loop.step, single.params, start.outputs, arrival)
+    state_differs = dependence(start, per_run.first)
+    differ = _that_differ(step, per_run.params, state_differs, per_run.arrivals)
+    return OneRun(start, step, *differ)
+
+
+def _portion_of(run: OneRun, shown: Any, per_run: Inputs, value: Array, ahead: bool) -> Portion:
+    """How many runs and steps at a time, for an estimate of such a size."""
+    runs, steps, _ = value.shape
+    own, shared, largest = _sizes(run.start.outputs, run.state_differs, shown)
+    of_key = dependence(
+        run.start,
+        per_run._replace(params=_alike(per_run.params), prior=_alike(per_run.prior)).first,
+    )
     draws = any(jax.tree.leaves(of_key))
-    together = goes_together(step)
-    size = group_size(runs, own, 0 if ahead else shared, largest, dtype.itemsize, together, draws)
-    shown = parted(step.outputs[1], differ[1])[0]
-    block = block_size(steps, size * sum(x.size * x.dtype.itemsize for x in shown), together)
-    portion = Portion(size, block, together)
-    if ahead and 1 < size < runs:
-        return _shared_ahead(loop, parts, inputs, flags, differ, portion)
-    return _in_groups(loop, inputs, flags, differ, portion)
+    together = goes_together(run.step)
+    kept = 0 if ahead else shared
+    size = group_size(runs, own, kept, largest, value.dtype.itemsize, together, draws)
+    seen = parted(run.step.outputs[1], run.seen_differs)[0]
+    block = block_size(steps, size * sum(x.size * x.dtype.itemsize for x in seen), together)
+    return Portion(size, block, together)
 
 
 def _that_differ(step: Traced, params_f: Any, state_f: Any, arrival_f: Any) -> tuple[Any, Any]:
@@ -107,59 +158,59 @@ def _sizes(state: Any, state_f: Any, shown: Any) -> tuple[int, int, int]:
 def _shared_ahead(
     loop: Loop,
     parts: Divided,
-    inputs: Any,
-    flags: Any,
+    inputs: Inputs,
+    per_run: Inputs,
     differ: tuple[Any, Any],
     portion: Portion,
 ) -> tuple[Any, Any]:
     """What all runs share is computed first, once for all groups, which then read what they need
     of it at each arrival."""
-    params, measurements, prior, times, keys, context = inputs
-    params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
-    state_f, seen_f = differ
-    arrival_f = measurements_f, times_f, context_f
-    runs, steps = measurements.value.shape[:2]
+    state_differs, seen_differs = differ
+    runs, steps = inputs.measurements.value.shape[:2]
 
     @partial(jax.checkpoint, prevent_cse=False)
     def step_ahead(state: list[Array], arrival: list[Array]) -> tuple[Any, Any]:
-        outputs, needed = parts.ahead([*parted(params, params_f)[1], *state, *arrival])
+        shared_params = parted(inputs.params, per_run.params)[1]
+        outputs, needed = parts.ahead([*shared_params, *state, *arrival])
         return outputs[: len(state)], (outputs[len(state) :], needed)
 
-    first = one_run((params, prior, keys), (params_f, prior_f, keys_f))
-    state = parted(loop.start(*first), state_f)[1]
-    arrivals = parted((measurements, times, context), arrival_f)[1]
+    state = parted(loop.start(*one_run(inputs.first, per_run.first)), state_differs)[1]
+    arrivals = parted(inputs.arrivals, per_run.arrivals)[1]
     last, (seen, needed) = lax.scan(step_ahead, state, arrivals, steps)
 
     def start(params: Any, prior: Any, key: Any) -> Any:
-        return parted(loop.start(params, prior, key), state_f)[0]
+        return parted(loop.start(params, prior, key), state_differs)[0]
 
     def step(params: Any, state: list[Array], arrival: Any) -> tuple[Any, Any]:
         measurement, time, (seen, needed) = arrival
-        own = parted((measurement, time, seen), arrival_f)[0]
+        own = parted((measurement, time, seen), per_run.arrivals)[0]
         outputs = parts.rest([*jax.tree.leaves(params), *state, *own], needed)
         return outputs[: len(state)], outputs[len(state) :]
 
     found = _in_groups(
         Loop(start, step),
-        (params, measurements, prior, times, keys, (context, needed)),
-        (*flags[:-1], (context_f, [False] * len(needed))),
+        inputs._replace(context=(inputs.context, needed)),
+        per_run._replace(context=(per_run.context, [False] * len(needed))),
         tuple([f for f in jax.tree.leaves(tree) if f] for tree in differ),
         portion,
     )
     for_all = [[jnp.broadcast_to(x, (runs, *x.shape)) for x in shared] for shared in (seen, last)]
-    return joined(found[0], for_all[0], seen_f), joined(found[1], for_all[1], state_f)
+    return (
+        joined(found[0], for_all[0], seen_differs),
+        joined(found[1], for_all[1], state_differs),
+    )
 
 
 def _in_groups(
-    loop: Loop, inputs: Any, flags: Any, differ: Sequence[Any], portion: Portion
+    loop: Loop, inputs: Inputs, per_run: Inputs, differ: Sequence[Any], portion: Portion
 ) -> tuple[Any, Any]:
-    same = _alike((flags, differ))
+    alone = _alike((per_run, differ))
 
-    def group(inputs: Any, place: Place | None) -> tuple[Any, Any]:
-        inside, differ_inside = (flags, differ) if portion.runs > 1 else same
-        return _scanned(loop, inputs, inside, differ_inside, portion, place)
+    def group(inputs: Inputs, place: Place | None) -> tuple[Any, Any]:
+        flags, differ_inside = (per_run, differ) if portion.runs > 1 else alone
+        return _scanned(loop, inputs, flags, differ_inside, portion, place)
 
-    return in_groups(group, inputs, flags, inputs[1].value.shape[0], portion)
+    return in_groups(group, inputs, per_run, inputs.measurements.value.shape[0], portion)
 
 
 def _alike(flags: Any) -> Any:
@@ -168,31 +219,29 @@ def _alike(flags: Any) -> Any:
 
 def _scanned(
     loop: Loop,
-    inputs: Any,
-    flags: Any,
+    inputs: Inputs,
+    per_run: Inputs,
     differ: Sequence[Any],
     portion: Portion,
     place: Place | None,
 ) -> tuple[Any, Any]:
     """The same from inputs with the runs last."""
     runs = portion.runs
-    params, measurements, prior, times, keys, context = inputs
-    params_f, measurements_f, prior_f, times_f, keys_f, context_f = flags
-    state_f, seen_f = differ
-    arrival_f = measurements_f, times_f, context_f
-    start = vmap_last(loop.start, (params_f, prior_f, keys_f), state_f, runs)
-    step = vmap_last(loop.step, (params_f, state_f, arrival_f), differ, runs)
+    state_differs, seen_differs = differ
+    start = vmap_last(loop.start, per_run.first, state_differs, runs)
+    flags = per_run.params, state_differs, per_run.arrivals
+    step = vmap_last(loop.step, flags, (state_differs, seen_differs), runs)
 
     def arrive(state: Any, arrival: Any) -> tuple[Any, Any]:
-        state, seen = step(params, runs_adjacent(state, state_f), arrival)
-        return runs_adjacent(state, state_f), seen
+        state, seen = step(inputs.params, runs_adjacent(state, state_differs), arrival)
+        return runs_adjacent(state, state_differs), seen
 
     seen, state = scan_in_blocks(
         arrive,
-        start(params, prior, keys),
-        (measurements, times, context),
-        lambda seen: runs_first(seen, seen_f, runs),
+        start(*inputs.first),
+        inputs.arrivals,
+        lambda seen: runs_first(seen, seen_differs, runs),
         portion,
         place,
     )
-    return seen, runs_first(state, state_f, runs)
+    return seen, runs_first(state, state_differs, runs)

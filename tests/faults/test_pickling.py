@@ -61,8 +61,8 @@ BUILT = {
     "fixed lag": lambda: ej.fixed_lag_ewif(moving_model(), 2.0, lag=1.0),
     "scenario": ej.scenarios.sine,
     "scenario with arrays": lambda: ej.scenarios.random_walk(q=jnp.asarray(2.0)),
-    "positive": ej.positive,
-    "psd": ej.psd,
+    "positive": ej.transforms.positive,
+    "psd": ej.transforms.psd,
 }
 BY_HAND = {
     "estimator": lambda: ej.Estimator(halved, doubled, halved, doubled),
@@ -102,7 +102,7 @@ def test_equal_things_are_equal_and_travel(name):
         (counted_model((1.0, 0.0)), counted_model((0.0, 1.0))),
         (ej.kalman(moving_model()), ej.extended(moving_model())),
         (ej.kalman(moving_model()), tuple(ej.kalman(moving_model()))),
-        (ej.positive(), ej.psd()),
+        (ej.transforms.positive(), ej.transforms.psd()),
         (BY_HAND["estimator"](), ej.Estimator(halved, halved, halved, halved)),
     ],
 )
@@ -202,7 +202,7 @@ def test_repr_is_the_call_in_short():
     assert repr(ej.kalman(moving_model())) == "kalman(constant_velocity(...))"
     assert repr(ej.ewif(counted_model(), tau=2.0)) == "ewif(linear_model(...), tau=2.0)"
     assert repr(counted_model()) == "linear_model(F, float64[1, 2], float64[1, 1])"
-    assert repr(ej.positive()) == "positive()"
+    assert repr(ej.transforms.positive()) == "positive()"
 
 
 def test_a_wrong_call_is_named_by_the_builder():

@@ -78,7 +78,8 @@ def groups(request, monkeypatch):
     size, together = request.param
     monkeypatch.setattr(loops, "group_size", lambda *_: size)
     monkeypatch.setattr(loops, "goes_together", lambda _: together)
-    monkeypatch.setattr(grouping, "_BLOCK", 1)  # several blocks, also of short steps
+    several_blocks = grouping.SIZES._replace(shown=1)  # also of short steps
+    monkeypatch.setattr(grouping, "SIZES", several_blocks)
     return size
 
 
@@ -281,8 +282,8 @@ def test_groups_are_no_larger_than_caches_and_waste_little(runs, joined, togethe
     for own, shared, largest, itemsize in ((108, 4, 144, 4), (216, 8, 288, 8), (1000, 0, 700, 4)):
         size = grouping.group_size(runs, own, shared, largest, itemsize, together)
         assert min(runs, 64) <= size <= runs
-        assert size * (own + shared) <= grouping._SECOND_CACHE
-        assert size * largest <= grouping._UNDIVIDED
+        assert size * (own + shared) <= grouping.SIZES.second_cache
+        assert size * largest <= grouping.SIZES.undivided
         assert -(-runs // size) * size <= 1.25 * runs
     assert grouping.group_size(runs, 10**6, 0, 10**6, 4) == 1
     assert grouping.group_size(runs, 20_008, 0, 16_000, 4, draws=True) == 1
