@@ -94,7 +94,7 @@ def _kinematic(
         H, H_where = matrix(n)
         linear = Linear(F, b, H, F_where, H_where)
     transition = affine_motion(F, b)
-    return Model(transition, process_cov, observe, cov, residual, linear, count)
+    return Model(transition, process_cov, observe, cov, residual, linear, count, returns_well=True)
 
 
 def _interval(t0: Any, t1: Any) -> Array:

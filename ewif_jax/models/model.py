@@ -31,7 +31,7 @@ class Linear(NamedTuple):
 
     F(params, t0, t1) -> (n, n); b(params, t0, t1) -> (n,) or None; H(params, sensor, t) -> (m, n).
     F_where and H_where: where F (in either direction) and H may differ from zero, if that is known;
-    what is zero is not computed.
+    what is zero is not computed. reversible: False where F is known to have no inverse.
     """
 
     F: Callable[..., Array]
@@ -39,6 +39,7 @@ class Linear(NamedTuple):
     H: Callable[..., Array]
     F_where: Pattern | None = None
     H_where: Pattern | None = None
+    reversible: bool = True
 
 
 class Model(NamedTuple):
@@ -51,6 +52,8 @@ class Model(NamedTuple):
     residual(value, predicted, sensor) -> (m,); wraps angles
     linear: the matrices if the model is linear
     sensors: how many there are, if known
+    returns_well: whether motion back in time loses no digits: over long intervals it grows as a
+        polynomial (kinematic motion), not exponentially
     """
 
     transition: Callable[..., Array]
@@ -60,6 +63,7 @@ class Model(NamedTuple):
     residual: Callable[..., Array] = subtract
     linear: Linear | None = None
     sensors: int | None = None
+    returns_well: bool = False
 
 
 def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
@@ -108,7 +112,8 @@ def linear_model(F: Any, H: Any, R: Any, Q: Any = None, b: Any = None) -> Model:
         return jnp.asarray(R(params, sensor, t))
 
     transition = affine_motion(F, b)
-    linear = Linear(F, b, H, _pattern_of_powers(given[0]), _pattern_of_table(given[1]))
+    patterns = _pattern_of_powers(given[0]), _pattern_of_table(given[1])
+    linear = Linear(F, b, H, *patterns, _full_rank(given[0]))
     return Model(transition, process_cov, observe, measurement_cov, subtract, linear, sensors)
 
 
@@ -207,6 +212,17 @@ def need_linear(model: Model, method: str) -> Linear:
     return model.linear
 
 
+def need_reversible(model: Model, method: str) -> Model:
+    """`model`, unless it is known that its motion cannot be followed back."""
+    checks.require(
+        model.linear is None or model.linear.reversible,
+        "model",
+        f"a model whose F has an inverse: {method} asks where a state came from",
+        "a singular F",
+    )
+    return model
+
+
 def _affine(
     F: Any, b: Any, params: Any, t0: Array, t1: Array, dtype: Any
 ) -> tuple[Array, Array | None]:
@@ -251,6 +267,11 @@ def _pattern_of_powers(F: Any) -> Pattern | None:
         return None
     n = np.shape(F)[0]
     return pattern(np.linalg.matrix_power((np.asarray(F) != 0) + np.eye(n), n))
+
+
+def _full_rank(F: Any) -> bool:
+    """Whether F has an inverse; True where that is not known."""
+    return callable(F) or bool(np.linalg.matrix_rank(np.asarray(F)) == len(F))
 
 
 def _pattern_of_table(H: Any) -> Pattern | None:
