@@ -91,15 +91,16 @@ def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
     value = np.asarray(x)
     got = value.dtype if value.ndim else Shown(x)
     require(_is_numeric(value), argument, "finite numbers", got)
-    asked = None if _all_finite(x) else known(mask)
+    asked = None if squares_are_finite(x) else known(mask)
     if asked is not None:
         bad = ~np.isfinite(value) & asked
         require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
 
 
 @once
-def _all_finite(x: Any) -> bool:
-    """Whether they surely are: one fast pass; but a sum of squares may also overflow."""
+def squares_are_finite(x: Any) -> bool:
+    """Whether all numbers and their squares surely are: one fast pass, of which the sum may also
+    overflow for other reasons."""
     value = np.asarray(x)
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.vdot(value, value)))
