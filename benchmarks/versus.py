@@ -1,4 +1,4 @@
-"""Two versions of the package in turns: ``python benchmarks/versus.py OTHER_CHECKOUT [--repeat N]``.
+"""Two versions of the package in turns: ``python benchmarks/versus.py OTHER_CHECKOUT``.
 
 Each version runs in a process of its own, on the same seeded workloads; the two take turns call by
 call, so that what else the machine does falls on both alike. A ratio is the time of the other

@@ -2,11 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ewif_jax.clocks import slack
+from ewif_jax.kernels.trees import choose
+from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, in_dtype
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -59,20 +61,49 @@ def arrive(
     """Moves `state` to a screened measurement (or to the clock's time) and updates it.
 
     With nothing in the measurement (mask all False) and no clock the filter stays where it is;
-    what is reported is its prediction. A time that is not a number counts as the state's.
+    what is reported is its prediction. What lies between two steps of a discrete model is
+    `REJECTED`, and moves nothing; so is a stamp ahead of the clock by more than rounding. A time
+    that is not a number counts as the state's, or the clock's.
     """
     measurement = cast(measurement, state.time.dtype)
-    is_time = jnp.isfinite(measurement.time)
-    asked = jnp.where(is_time, measurement.time, state.time) if clock_time is None else clock_time
-    target = jnp.maximum(state.time, asked)
-    measurement = measurement._replace(time=jnp.where(is_time, measurement.time, target))
+    now = state.time if clock_time is None else jnp.maximum(state.time, clock_time)
+    stamp = jnp.where(jnp.isfinite(measurement.time), measurement.time, now)
+    now, refused = _place(estimator, state.time, now, stamp, clock_time is not None)
+    if refused is not None:
+        # Masked, and at a time that the model can answer for: NaN would reach derivatives.
+        shown_time = jnp.where(refused, now, stamp)
+        shown = measurement._replace(time=shown_time, mask=measurement.mask & ~refused)
+    else:
+        shown = measurement._replace(time=stamp)
+    target = jnp.maximum(now, shown.time) if clock_time is None else now
     moved = estimator.predict(params, state, target)
-    updated, info = estimator.update(params, moved, measurement)
+    updated, info = estimator.update(params, moved, shown)
+    if refused is not None:
+        status = jnp.where(
+            refused & jnp.any(measurement.mask), jnp.int32(Status.REJECTED), info.status
+        )
+        info = info._replace(delay=jnp.where(refused, now - stamp, info.delay), status=status)
     if clock_time is not None:
-        return Arrival(updated, updated, info)
-    present = jnp.any(measurement.mask)
-    kept = jax.tree.map(lambda new, old: jnp.where(present, new, old), updated, state)
-    return Arrival(kept, updated, info)
+        kept = updated if refused is None else choose(refused, state, updated)
+        return Arrival(kept, updated, info)
+    return Arrival(choose(jnp.any(shown.mask), updated, state), updated, info)
+
+
+def _place(
+    estimator: Estimator, start: Array, now: Array, stamp: Array, by_clock: bool
+) -> tuple[Array, Array | None]:
+    """Where a filter at `start` is when its clock shows `now`, and whether a measurement of time
+    `stamp` is to be refused there; None where none ever is."""
+    refused = None
+    steps = None if estimator.model is None else estimator.model.steps
+    if steps is not None:
+        in_step = whole_steps(steps, start, now)
+        now = jnp.where(in_step, now, start)
+        refused = ~in_step | ~whole_steps(steps, now, stamp)
+    if by_clock:
+        ahead = stamp > now + slack(jnp, stamp, now)
+        refused = ahead if refused is None else refused | ahead
+    return now, refused
 
 
 def initial(

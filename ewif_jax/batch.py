@@ -28,6 +28,8 @@ from ewif_jax.fast.layout import (
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
+from ewif_jax.fast.memo import once
+from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
@@ -111,7 +113,7 @@ class Content(NamedTuple):
     """What is not a number has been taken out (see `screen`)."""
 
 
-@checks.once
+@once
 def _examined(
     estimator: Estimator,
     params: Any,
@@ -183,6 +185,8 @@ def check_runs(
     """Refuses what `run` refuses, with the first run for all, the largest sensor of any run, and
     the parameters also of the runs in which one of them is lowest."""
     params, params_f = inputs[0], flags[0]
+    dtype = float_dtype(inputs[1].value)
+    check_times(estimator.model, inputs[1], t0, dtype, inputs[3])
     _, measurements, prior, times = one_run(inputs, flags)
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
@@ -199,7 +203,8 @@ def _lowest(params: Any, flags: Any) -> set[int]:
         for x, f in zip(*map(jax.tree.leaves, (params, flags)), strict=True)
         if f and jnp.ndim(x) == 1 and jnp.issubdtype(jnp.result_type(x), jnp.number)
     ]
-    return {int(np.argmin(x)) for x in numbers if x is not None}
+    finite = [np.where(np.isfinite(x), x, -np.inf) for x in numbers if x is not None]
+    return {int(np.argmin(x)) for x in finite}
 
 
 def _filtered(

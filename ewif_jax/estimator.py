@@ -9,7 +9,8 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
-from ewif_jax.streams import float_dtype
+from ewif_jax.models.entry import check_times
+from ewif_jax.streams import checked_stream, float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
@@ -30,7 +31,11 @@ def step(
         params: what its parameters are read from.
         state: from `estimator.init` or an earlier `step`.
         measurement: one arrival: time (), value (m,), sensor (), mask (m,).
+
+    Raises:
+        ValueError: a known time between two steps of a discrete model.
     """
+    check_times(estimator.model, measurement, state.time, state.time.dtype)
     screened, refused = screen(measurement, state.time.dtype)
     arrival = arrive(estimator, params, state, screened)
     return arrival.kept, marked(arrival.info, refused)
@@ -69,7 +74,7 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    checks.stream(measurements)
+    checked_stream(measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = prior_in(prior, float_dtype(measurements.value))

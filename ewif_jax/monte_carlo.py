@@ -13,6 +13,7 @@ from ewif_jax import checks
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.dependence import dependence, traced
 from ewif_jax.fast.layout import Frozen, broadcast_prefix
+from ewif_jax.recipe import FromRecipe
 from ewif_jax.scores import Score, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -29,14 +30,16 @@ class Simulation(NamedTuple):
 RUN_STEPS = 2**20
 
 
-class Scenario(NamedTuple):
-    """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
-    start (prior, t0), and the clock of `run`."""
-
+class _Scenario(NamedTuple):
     simulate: Callable[[Array], Simulation]
     prior: Gaussian | None
     t0: Any
     clock: Clock = "validity"
+
+
+class Scenario(FromRecipe, _Scenario):
+    """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
+    start (prior, t0), and the clock of `run`."""
 
 
 class Statistics(NamedTuple):
@@ -161,12 +164,18 @@ def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:
     """One simulation per key, stacked on axis 0; what does not depend on the key stays shared
     (without that axis), so that filters compute with it once."""
     flags = dependence(traced(scenario.simulate, keys[0]), True)
-    return _simulate(scenario.simulate, keys, Frozen(flags))
+    # A scenario of a builder is compiled once for all that are equal; one made by hand may hold
+    # arrays, which cannot be compared.
+    source = scenario.simulate if scenario.recipe is None else scenario
+    return _simulate(source, keys, Frozen(flags))
 
 
-@partial(jax.jit, static_argnames=("simulate", "flags"))
-def _simulate(simulate: Callable[[Array], Simulation], keys: Array, flags: Frozen) -> Simulation:
+@partial(jax.jit, static_argnames=("source", "flags"))
+def _simulate(
+    source: Scenario | Callable[[Array], Simulation], keys: Array, flags: Frozen
+) -> Simulation:
     axes = jax.tree.map(lambda f: 0 if f else None, flags.tree)
+    simulate = source.simulate if isinstance(source, Scenario) else source
     return jax.vmap(simulate, out_axes=axes)(keys)
 
 

@@ -18,7 +18,7 @@ from ewif_jax.analysis.consistency import nees, nis
 from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.compiling import array
-from ewif_jax.streams import float_dtype
+from ewif_jax.streams import checked_stream, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]
@@ -90,7 +90,7 @@ def scored(
     """
     if np.ndim(measurements.value) == 2:
         measurements = measurements._replace(value=array(measurements.value)[None])
-    checks.stream(measurements, batched=True)
+    checked_stream(measurements, batched=True)
     runs, steps = np.shape(measurements.value)[:2]
     truth = array(np.zeros((steps, 0)) if truth is None else truth)
     lead = ("R", "T") if truth.ndim == 3 else ("T",)

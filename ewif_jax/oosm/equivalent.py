@@ -9,7 +9,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared
 from ewif_jax.types import Measurement
@@ -54,11 +54,11 @@ def tied_to_start(
     now = state.time
     time = jnp.clip(measurement.time, start.time, now)
     F_where, H_where = patterns(model)
-    there, F, Q = flow(model, params, start.mean, start.time, time)
+    there, F, Q = predict_state(model, params, start.mean, start.time, time)
     cov = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q)
-    predicted, F, Q = flow(model, params, there, time, now)
+    predicted, F, Q = predict_state(model, params, there, time, now)
     M = symmetric.congruence(F, cov, F_where) + symmetric.pack(Q)
-    value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+    value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     weights, _ = symmetric.regress(M, matmul(symmetric.rows(H, cov, H_where), F.T))
     value = value + matvec(weights, state.mean - predicted)
@@ -97,7 +97,7 @@ def moved_back(
     """
     dtype, good = state.mean.dtype, jnp.asarray(True)
     at = jnp.clip(measurement.time, start.time, state.time)
-    predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
+    predicted, F, Q_all = predict_state(model, params, start.mean, start.time, state.time)
     F_where, H_where = patterns(model)
     M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
@@ -107,10 +107,10 @@ def moved_back(
     if not model.returns_well:
         # The derivative of a motion that overflows is not a number even where it is not selected,
         # so the time is replaced, not the matrix.
-        good = lax.stop_gradient(_returns(flow(model, params, origin, state.time, at)[1]))
+        good = lax.stop_gradient(_returns(predict_state(model, params, origin, state.time, at)[1]))
         at = jnp.where(good, at, state.time)
-    there, back, _ = flow(model, params, origin, state.time, at)
-    value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+    there, back, _ = predict_state(model, params, origin, state.time, at)
+    value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     seen = matmul(H, back, H_where)
     noisy = matmul(seen, Q)

@@ -71,7 +71,7 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)
 
 
 def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceState]:

@@ -11,7 +11,8 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import copies
-from ewif_jax.models import Model, flow
+from ewif_jax.models import Model, predict_state
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -30,6 +31,7 @@ class PathState(NamedTuple):
     past: Array
 
 
+@from_recipe
 def pf_extended(
     model: Model,
     particles: int,
@@ -111,7 +113,7 @@ def pf_extended(
         used = state.used | form.was_used(info)
         return state._replace(log_weights=log_weights, key=key, used=used), info
 
-    return Estimator(init, predict, update, form.estimate)
+    return Estimator(init, predict, update, form.estimate, model=model)
 
 
 def _between(model: Model, params: Any, state: PathState, time: Array, key: Array) -> Array:
@@ -124,8 +126,8 @@ def _between(model: Model, params: Any, state: PathState, time: Array, key: Arra
     time = jnp.clip(time, start, end)
 
     def draw(x: Array, target: Array, normals: Array) -> Array:
-        there, _, Q_before = flow(model, params, x, start, time)
-        arrived, F, Q_after = flow(model, params, there, time, end)
+        there, _, Q_before = predict_state(model, params, x, start, time)
+        arrived, F, Q_after = predict_state(model, params, there, time, end)
         gain, left_over = retrodiction.bridge(Q_before, F, Q_after)
         root = cholesky.factor(left_over).lower
         return there + matvec(gain, target - arrived) + matvec(root, normals)

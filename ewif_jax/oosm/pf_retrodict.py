@@ -8,11 +8,13 @@ from jax import Array, lax
 
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions.particles import ParticleState, Seen
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def pf_retrodict(
     model: Model,
     particles: int,
@@ -74,4 +76,4 @@ def pf_retrodict(
         log_weights, info = form.weigh(state, seen, measurement, True, collapse)
         return state._replace(log_weights=log_weights, key=key), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model)

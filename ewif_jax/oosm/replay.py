@@ -10,6 +10,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive
 from ewif_jax.kernels.trees import choose
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.partial_use import partly
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
@@ -28,6 +29,7 @@ class ReplayState(NamedTuple):
     shares: Array | None = None
 
 
+@from_recipe
 def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     """The estimator as it would be had every measurement come in order of validity time.
 
@@ -116,7 +118,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     def estimate(params: Any, state: ReplayState) -> Gaussian:
         return estimator.estimate(params, state.current)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=estimator.model)
 
 
 def _padded(measurement: Measurement, width: int) -> Measurement:

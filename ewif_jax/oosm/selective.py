@@ -9,10 +9,12 @@ from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import resolve
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.partial_use import partly, prepared
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Estimator:
     r"""The estimator that uses a late measurement only if it is fresh enough.
 

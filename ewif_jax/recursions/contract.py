@@ -12,6 +12,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models import Model
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
@@ -59,6 +60,7 @@ class Recursion(NamedTuple):
     reach: how far back it uses late measurements; None: not at all.
     moves_back: `move` takes times before the state's too. Otherwise they are predicted as NaN in
         the fields `estimated` of the state.
+    model: of which the filter is one; its times are checked with it.
     starts_from_nothing: `init` accepts prior=None.
     draws: `init` needs a key.
     keeps: a measurement of which nothing is present leaves the state as it is, to the last bit. A
@@ -77,6 +79,7 @@ class Recursion(NamedTuple):
     draws: bool = False
     keeps: bool = False
     estimated: tuple[str, ...] = ("mean", "cov")
+    model: Model | None = None
 
 
 def estimator_from(recursion: Recursion) -> Estimator:
@@ -124,7 +127,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
             within_reach |= recursion.reach(params, state, measurement.time)
         return offered(take, params, state, measurement, within_reach)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=recursion.model)
 
 
 def offered(

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_state
 from ewif_jax.recursions.contract import Recursion, estimator_from
-from ewif_jax.recursions.innovations import Compared, updated
+from ewif_jax.recursions.innovations import compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -43,7 +42,7 @@ def covariance_form(
         return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
     def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
-        mean, F, Q = flow(model, params, state.mean, state.time, time)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         cov = symmetric.congruence(F, state.cov, patterns(model)[0])
         if inflation is not None:
             cov = _inflated(cov, inflation(params, state.time, time))
@@ -59,7 +58,9 @@ def covariance_form(
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return estimator_from(Recursion(method, start, move, measure_now, estimate, keeps=True))
+    return estimator_from(
+        Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)
+    )
 
 
 def measure(
@@ -69,10 +70,8 @@ def measure(
     (delay 0, status USED or REJECTED). The last `still` components of the state are not the
     model's, which neither moves nor sees them."""
     moving = mean[: mean.shape[0] - still]
-    predicted, H, R = sight(model, params, moving, measurement.sensor, measurement.time)
-    checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    difference = model.residual(measurement.value, predicted, measurement.sensor)
-    seen = Compared(difference, unseen(H, still), R, measurement.mask)
+    seen = compared(model, params, moving, measurement)
+    seen = seen._replace(H=unseen(seen.H, still))
     where = patterns(model)[1]
     if where is not None:
         where = tuple(row + (False,) * still for row in where)

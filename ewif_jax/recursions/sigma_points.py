@@ -10,7 +10,8 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.model import Model, flow, resolve
+from ewif_jax.models.linearise import predict_state
+from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
 from ewif_jax.recursions.innovations import Compared, updated
@@ -78,7 +79,7 @@ def flow_around(
     """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0: of
     all but the last `still` components, which do not move."""
     if points is None:
-        return flow(model, params, mean[: mean.shape[0] - still], t0, t1)
+        return predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
 
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)

@@ -9,6 +9,7 @@ import xarray as xr
 from ewif_jax.analysis.merit import maneuvering_index, random_walk_cutoff, random_walk_gain
 from ewif_jax.estimator import run as run_filter
 from ewif_jax.estimators.ewif import ewif
+from ewif_jax.losses import rmse_loss
 from ewif_jax.monte_carlo import Scenario, Simulation, simulate_batch
 from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.selective import selective
@@ -16,7 +17,7 @@ from ewif_jax.scenarios.arrowhead import arrowhead, arrowhead_model
 from ewif_jax.study import arrowhead_figures
 from ewif_jax.study.experiment import Experiment
 from ewif_jax.study.late import history_needed, paired, rmse, rmses, sweep
-from ewif_jax.tuning import rmse_loss, tune
+from ewif_jax.tuning import tune
 from ewif_jax.types import Estimator
 
 Q, VARIANCE, RATIO = 20.0, 2000.0, 0.6

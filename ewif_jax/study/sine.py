@@ -15,13 +15,14 @@ from ewif_jax.analysis.merit import random_walk_gain
 from ewif_jax.estimator import run as run_filter
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.information import information
+from ewif_jax.losses import rmse_loss
 from ewif_jax.monte_carlo import monte_carlo, simulate_batch
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
 from ewif_jax.streams import stream
 from ewif_jax.study import sine_figures, two_sided
 from ewif_jax.study.experiment import Experiment, Measured
 from ewif_jax.study.folder import Arrays
-from ewif_jax.tuning import rmse_loss, tune
+from ewif_jax.tuning import tune
 from ewif_jax.types import Estimator
 
 DT, VARIANCE = 0.1, 0.5

@@ -16,7 +16,7 @@ from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.asd import asd
 from ewif_jax.study.experiment import Refused
 from ewif_jax.study.tracks import Tracks
-from ewif_jax.tuning import Transform, positive
+from ewif_jax.transforms import Transform, positive
 from ewif_jax.types import Estimator, Gaussian
 
 MODELS = {

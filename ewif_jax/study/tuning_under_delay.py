@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from ewif_jax.estimators.ewif import ewif
+from ewif_jax.losses import rmse_loss
 from ewif_jax.monte_carlo import Simulation, simulate_batch
 from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.selective import selective
@@ -18,7 +19,7 @@ from ewif_jax.study.arrowhead import VARIANCE, stale
 from ewif_jax.study.experiment import Experiment
 from ewif_jax.study.figures import EWIF, OTHER, TRUTH, canvas, label
 from ewif_jax.study.late import history_needed, paired, rmse, sweep
-from ewif_jax.tuning import Tuned, rmse_loss, tune
+from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Estimator, Gaussian
 
 SOFTNESS = 0.5
