@@ -101,7 +101,8 @@ def _place(
         now = jnp.where(in_step, now, start)
         refused = ~in_step | ~whole_steps(steps, now, stamp)
     if by_clock:
-        ahead = stamp > now + slack(jnp, stamp, now)
+        rounding = 4 * jnp.finfo(stamp.dtype).eps * jnp.maximum(jnp.abs(stamp), jnp.abs(now))
+        ahead = stamp > now + rounding
         refused = ahead if refused is None else refused | ahead
     return now, refused
 

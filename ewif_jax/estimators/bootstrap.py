@@ -77,4 +77,4 @@ def bootstrap(
         log_weights, info = form.weigh(state, seen, measurement, reachable=False)
         return state._replace(log_weights=log_weights), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

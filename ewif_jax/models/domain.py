@@ -58,7 +58,7 @@ def covariance(argument: str, value: Any) -> Array:
     low = ROUNDING * jnp.max(variances)
     spread = jnp.sqrt(jnp.maximum(variances, 0) + low)
     good = jnp.all(variances >= -low) & jnp.all(
-        (abs(value) <= (1 + ROUNDING) * spread[:, None] * spread) & (abs(value) < jnp.inf)
+        (abs(value) <= (1 + ROUNDING) * spread[:, None] * spread[None, :]) & (abs(value) < jnp.inf)
     )
     return jnp.where(good, value, jnp.nan)
 

@@ -32,4 +32,4 @@ def drop_late(estimator: Estimator) -> Estimator:
         in_sequence = measurement.time >= state.time
         return offered(take, params, state, measurement, in_sequence)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=estimator.model)

@@ -149,7 +149,7 @@ def pf_fixed_point(
         weighed = state._replace(log_weights=log_weights, key=key)
         return _remembered(weighed, measurement, form.was_used(info)), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
 
 
 def _size(model: Model, params: Any, at: CovarianceState) -> int:

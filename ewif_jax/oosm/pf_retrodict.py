@@ -76,4 +76,4 @@ def pf_retrodict(
         log_weights, info = form.weigh(state, seen, measurement, True, collapse)
         return state._replace(log_weights=log_weights, key=key), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

@@ -20,13 +20,13 @@ class Start(Protocol):
     """The state at t0. `prior` is a checked `Gaussian` of arrays in one dtype (None only if the
     recursion `starts_from_nothing`), t0 () has that dtype."""
 
-    def __call__(self, params: Any, prior: Any, t0: Array, key: Any) -> Any: ...
+    def __call__(self, params: Any, prior: Any, t0: Array, key: Any, /) -> Any: ...
 
 
 class Move(Protocol):
     """The state at `time`, which is not before the state's (unless the recursion `moves_back`)."""
 
-    def __call__(self, params: Any, state: Any, time: Array) -> Any: ...
+    def __call__(self, params: Any, state: Any, time: Array, /) -> Any: ...
 
 
 class Measure(Protocol):
@@ -37,19 +37,21 @@ class Measure(Protocol):
     present the innovation is 0, its covariance the identity, and the log likelihood 0.
     """
 
-    def __call__(self, params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]: ...
+    def __call__(
+        self, params: Any, state: Any, measurement: Measurement, /
+    ) -> tuple[Any, Info]: ...
 
 
 class Report(Protocol):
     """What is estimated of the state at its time."""
 
-    def __call__(self, params: Any, state: Any) -> Gaussian: ...
+    def __call__(self, params: Any, state: Any, /) -> Gaussian: ...
 
 
 class Reach(Protocol):
     """Whether a measurement of this `time`, before the state's, can still be used, () bool."""
 
-    def __call__(self, params: Any, state: Any, time: Array) -> Array: ...
+    def __call__(self, params: Any, state: Any, time: Array, /) -> Array: ...
 
 
 class Recursion(NamedTuple):

@@ -157,4 +157,4 @@ def fixed_lag_ewif(
         behind = checks.at_least("lag", resolve(lag, params), 0.0)
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
-    return filtered._replace(estimate=estimate)
+    return Estimator(*filtered[:3], estimate, model=model)
