@@ -68,6 +68,8 @@ def update(
     zero `H_where`. The covariance is
     (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
     result of the first, which is what makes the Joseph form forget rounding errors of the gain.
+    What P itself was rounded by it cannot forget: where that exceeds a variance that is left (a
+    prior 1/eps times as wide as R), the variance is 0, never negative.
     """
     H, R = jnp.where(mask[:, None], H, 0), mask_cov(R, mask)
     cross = symmetric.rows(H, packed, H_where)
@@ -133,9 +135,10 @@ def _left_over(R: Array, weights: Array, seen: Array) -> Array:
 
 @kernel
 def _more(half: Array, weights: Array, left_over: Array) -> Array:
-    """half + K left_over, packed."""
+    """half + K left_over, packed, no variance below 0."""
     rows, cols = np.triu_indices(weights.shape[1])
-    return half + _contract(weights[:, rows], left_over[:, cols])
+    cov = half + _contract(weights[:, rows], left_over[:, cols])
+    return symmetric.no_negative(cov)
 
 
 def _contract(a: Array, b: Array) -> Array:

@@ -84,6 +84,11 @@ def propagated(
     return _propagated(where)(a, packed, plus, known)
 
 
+def no_negative(packed: Array) -> Array:
+    """P, where a variance that rounding has made negative is 0."""
+    return _no_negative(packed)
+
+
 def rows(a: Array, packed: Array, where: Pattern | None = None) -> Array:
     """a P (m, n) for a matrix a (m, n) and a packed P; `where` a may differ from zero."""
     return _rows(where)(a, packed)
@@ -213,6 +218,13 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
         return others - reciprocal[None] * left * right
 
     return swept
+
+
+@kernel
+def _no_negative(packed: Array) -> Array:
+    rows, cols = np.triu_indices(order(packed))
+    variances = (rows == cols).reshape(-1, *(1,) * (packed.ndim - 1))
+    return jnp.where(variances & (packed < 0), 0, packed)
 
 
 @cache

@@ -104,7 +104,17 @@ def _kinematic(
         H, H_where = matrix(n)
         linear = Linear(F, b, H, F_where, H_where)
     transition = affine_motion(F, b)
-    return Model(transition, process_cov, observe, cov, residual, linear, count, check=check)
+    return Model(
+        transition,
+        process_cov,
+        observe,
+        cov,
+        residual,
+        linear,
+        count,
+        check=check,
+        returns_well=True,
+    )
 
 
 def _interval(t0: Any, t1: Any) -> Array:

@@ -53,6 +53,7 @@ class _Model(NamedTuple):
     sensors: int | None = None
     steps: Steps | None = None
     check: Callable[..., None] | None = None
+    returns_well: bool = False
 
 
 class Model(FromRecipe, _Model):
@@ -68,6 +69,8 @@ class Model(FromRecipe, _Model):
     steps: how time is counted if the model is discrete (what is between two steps is NaN)
     check: check(params, t0, t1, sensors) refuses known parameters that make no covariances; None:
         process_cov and measurement_cov are looked at
+    returns_well: whether motion back in time loses no digits: over long intervals it grows as a
+        polynomial (kinematic motion), not exponentially
     """
 
 

@@ -1,6 +1,7 @@
 """A1: the exact update with a measurement that is one lag late."""
 
 from ewif_jax.models import Model
+from ewif_jax.oosm.equivalent import noise_estimated
 from ewif_jax.oosm.history import one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
@@ -20,17 +21,19 @@ def a1(model: Model) -> Estimator:
     linearised.
 
     Args:
-        model: linear or not; it must allow motion back in time, and its process noise must compose
-            over parts of an interval.
+        model: linear or not; its process noise must compose over parts of an interval. One that is
+            not linear must allow motion back in time; where that is not finite, what is late is
+            `REJECTED`.
 
     Exact for a linear model and one late measurement per interval.
 
     Reduces to: `kalman` (or `extended`) at delay 0; `al1` with lag 1.
 
     Deviations: (76), (80) and (81) are written with the estimates at both ends of the interval, so
-        that several measurements at t_k, or late ones taken before, need not be remembered.
+        that several measurements at t_k, or late ones taken before, need not be remembered. A
+        linear model is not moved back where that could lose digits: as in `al1`.
 
     Raises:
         ValueError: `init` with `prior=None`.
     """
-    return one_step(model, "a1", 1, noise_estimated=True)
+    return one_step(model, "a1", 1, noise_estimated)

@@ -1,6 +1,10 @@
 """Bl1: the one-step solution that leaves the process noise out."""
 
+from functools import partial
+
 from ewif_jax.models import Model
+from ewif_jax.models.linearise import need_reversible
+from ewif_jax.oosm.equivalent import moved_back
 from ewif_jax.oosm.history import one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
@@ -17,7 +21,8 @@ def bl1(model: Model, lag: int) -> Estimator:
     Yamakita with (76) set to zero. The gain is the best one for that retrodiction.
 
     Args:
-        model: linear or not; as for `al1`.
+        model: linear or not; it must allow motion back in time, and its process noise must compose
+            over parts of an interval. Where motion back is not finite, what is late is `REJECTED`.
         lag: how many past update times are kept, >= 1. A measurement older than all of them, or
             than t0, is `TOO_LATE`.
 
@@ -26,6 +31,9 @@ def bl1(model: Model, lag: int) -> Estimator:
     Reduces to: `kalman` (or `extended`) at delay 0; `b1` for lag = 1.
 
     Raises:
-        ValueError: lag < 1; `init` with `prior=None`.
+        ValueError: lag < 1; a constant F without inverse; `init` with `prior=None`.
     """
-    return one_step(model, "bl1", lag, noise_estimated=False)
+    equivalent = partial(moved_back, noise_estimated=False)
+    estimator = one_step(model, "bl1", lag, equivalent)
+    need_reversible(model, "bl1")
+    return estimator

@@ -10,6 +10,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, patterns, predict_measurement, predict_state
+from ewif_jax.oosm.equivalent import noise_estimated
 from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
@@ -64,7 +65,7 @@ def rts_reference(model: Model, lag: int) -> Estimator:
     Raises:
         ValueError: lag < 1; `init` with `prior=None`.
     """
-    form = one_step(model, "rts_reference", lag, noise_estimated=True)
+    form = one_step(model, "rts_reference", lag, noise_estimated)
 
     def update(
         params: Any, state: HistoryState, measurement: Measurement
