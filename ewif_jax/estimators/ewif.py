@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recursions import information as form
@@ -90,4 +91,4 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         del params
         return form.settled(state)
 
-    return Estimator(init, predict, update, estimate, model)
+    return Estimator(init, predict, update, estimate, without_process_noise(model))
