@@ -103,9 +103,10 @@ def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
     """The first bad stamp and its row."""
     if not bad.any():
         return ""
-    index = tuple(int(i) for i in np.argwhere(bad)[0])
-    run = f" of run {index[0]}" if len(index) > 1 else ""
-    return f"{stamps[index]:.10g} at row {index[-1]}{run}"
+    place = int(np.flatnonzero(bad)[0])
+    number, row = divmod(place, np.shape(stamps)[stamps.ndim - 1])
+    run = f" of run {number}" if stamps.ndim > 1 else ""
+    return f"{stamps.ravel()[place]:.10g} at row {row}{run}"
 
 
 def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:
