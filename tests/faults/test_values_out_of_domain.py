@@ -108,10 +108,10 @@ def test_a_method_that_ignores_the_process_noise_needs_none():
 
 
 def test_a_name_that_params_has_not():
-    with pytest.raises(ValueError, match="params: expected the name 'q', .*'r'"):
+    with pytest.raises(ValueError, match=r"params: expected the name 'q', .*'r'"):
         ej.run(ej.kalman(KINEMATIC), {"r": 0.5}, STREAM, prior=PRIOR, t0=0.0)
+    estimator = ej.ewif(ej.models.random_walk(sensors=SENSOR(1.0)), lambda p: p["tau"])
     with pytest.raises(ValueError, match="'tau'"):
-        estimator = ej.ewif(ej.models.random_walk(sensors=SENSOR(1.0)), lambda p: p["tau"])
         ej.run(estimator, {"Tau": 0.5}, STREAM, prior=None, t0=0.0)
     with pytest.raises(ValueError, match="got None"):
         ej.run(ej.kalman(KINEMATIC), None, STREAM, prior=PRIOR, t0=0.0)
