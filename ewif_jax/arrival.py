@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax.clocks import slack
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, in_dtype

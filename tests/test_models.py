@@ -123,7 +123,7 @@ def test_a_nonlinear_flow_is_differentiated():
     close(H, [[0.6, 0.0]])
 
 
-def test_constants_speak_of_one_step():
+def test_constants_speak_of_one_step_of_several_and_back():
     F, Q, b = np.array([[1.0, 0.1], [0.0, 0.9]]), np.diag([0.1, 0.2]), np.array([0.3, -0.4])
     model = ej.linear_model(F, np.eye(2), np.eye(2), Q, b)
     x = jnp.asarray([1.0, 2.0])
@@ -131,11 +131,15 @@ def test_constants_speak_of_one_step():
     def move(t0, t1):
         return model.transition(None, x, jnp.asarray(t0), jnp.asarray(t1))
 
-    close(move(0.0, 5.0), F @ x + b)
+    close(move(0.0, 1.0), F @ x + b)
+    close(move(0.0, 3.0), F @ (F @ (F @ x + b) + b) + b)
     close(move(1.0, 1.0), x)
-    close(model.transition(None, move(0.0, 1.0), jnp.asarray(1.0), jnp.asarray(0.0)), x)
-    close(Q_of(model, 0.0, 3.0), Q)
+    close(model.transition(None, move(0.0, 3.0), jnp.asarray(3.0), jnp.asarray(0.0)), x)
+    close(Q_of(model, 0.0, 1.0), Q)
+    close(Q_of(model, 0.0, 3.0), F @ (F @ Q @ F.T + Q) @ F.T + Q)
     close(Q_of(model, 2.0, 2.0), np.zeros((2, 2)))
+    assert np.isnan(move(0.0, 1.5)).all()
+    assert np.isnan(Q_of(model, 0.0, 1.5)).all()
 
 
 def test_a_singular_transition_runs_forward_and_is_nan_backward():

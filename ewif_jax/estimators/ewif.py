@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
@@ -92,4 +93,4 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         del params
         return form.settled(state)
 
-    return Estimator(init, predict, update, estimate, model=model)
+    return Estimator(init, predict, update, estimate, model=without_process_noise(model))

@@ -8,6 +8,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
@@ -125,4 +126,4 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     def estimate(params: Any, state: WindowState) -> Gaussian:
         return form.estimate(fit(params, state, state.time))
 
-    return Estimator(init, predict, update, estimate, model=model)
+    return Estimator(init, predict, update, estimate, model=without_process_noise(model))

@@ -1,5 +1,6 @@
 """The physical world, written once for all filters: how a state moves and what a sensor sees."""
 
+from ewif_jax.models.continuous_time import from_continuous
 from ewif_jax.models.coordinated_turn import coordinated_turn
 from ewif_jax.models.kinematic import (
     constant_acceleration,
@@ -27,6 +28,7 @@ __all__ = [
     "constant_acceleration",
     "constant_velocity",
     "coordinated_turn",
+    "from_continuous",
     "linear_model",
     "observation",
     "patterns",

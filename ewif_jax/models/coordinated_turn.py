@@ -93,8 +93,9 @@ def coordinated_turn(
         return driven + turned.astype(driven.dtype)
 
     def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
-        for argument, density in (("q", q), ("q_turn", q_turn)):
-            domain.check_variance(argument, resolve(density, params))
+        if t1 > t0:
+            for argument, density in (("q", q), ("q_turn", q_turn)):
+                domain.check_variance(argument, resolve(density, params))
         check_seen(params, t0, t1, sensors)
 
     return Model(transition, process_cov, observe, cov, residual, sensors=count, check=check)

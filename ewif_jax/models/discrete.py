@@ -196,7 +196,7 @@ def _doublings(F: Any, b: Any, Q: Any, steps: Steps) -> list[Stride]:
     table = [Stride(F, b, Q)]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(steps.max_steps.bit_length() - 1):
-            table.append(_then(table[-1], table[-1], np.matmul, np.matmul))
+            table.append(then(table[-1], table[-1], np.matmul, np.matmul))
     return table
 
 
@@ -209,18 +209,18 @@ def _power(one: Stride, table: list[Stride], k: Array, steps: Steps) -> Stride:
         if digit:
             # What no digit needs is never squared: it may overflow.
             square = _chosen(k >> digit > 0, square, still)
-            square = _then(square, square, matmul, matvec)
+            square = then(square, square, matmul, matvec)
         if table:
             known = zip(table[digit], square, strict=True)
             square = Stride(
                 *(y if x is None or y is None else jnp.asarray(x, y.dtype) for x, y in known)
             )
-        total = _then(total, _chosen((k >> digit) % 2 == 1, square, still), matmul, matvec)
+        total = then(total, _chosen((k >> digit) % 2 == 1, square, still), matmul, matvec)
     return total
 
 
-def _then(first: Stride, second: Stride, matmul: Function, matvec: Function) -> Stride:
-    """Both, one after the other."""
+def then(first: Stride, second: Stride, matmul: Function, matvec: Function) -> Stride:
+    """What both do, one after the other."""
     b, Q = None, None
     if first.b is not None and second.b is not None:
         b = matvec(second.F, first.b) + second.b

@@ -65,10 +65,10 @@ def covariance(argument: str, value: Any) -> Array:
 
 def check_covariances(Q: Callable[..., Any] | None, R: Callable[..., Any] | None) -> Any:
     """A check (params, t0, t1, sensors) that Q(params, t0, t1) and R(params, sensor, t1) of known
-    parameters are covariances."""
+    parameters are covariances; of no interval (t0 = t1) Q is not asked."""
 
     def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
-        if Q is not None:
+        if Q is not None and t1 > t0:
             check_covariance("Q", Q(params, t0, t1))
         if R is not None:
             for sensor in sensors:

@@ -1,6 +1,8 @@
 """What every entry asks of a model before it traces anything: times it can count, and parameters
 that make covariances."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -58,6 +60,19 @@ def check_span(model: Model, sources: Any, times: Any) -> None:
         "the prior (give linear_model a larger max_steps=)",
         f"{far:.10g} s",
     )
+
+
+def without_process_noise(model: Model) -> Model:
+    """The model for a method that never asks for Q: parameters of Q may be missing."""
+    check = model.check or check_covariances(None, model.measurement_cov)
+    return model._replace(check=partial(_of_measurements, check))
+
+
+def _of_measurements(
+    check: Callable[..., None], params: Any, t0: Any, t1: Any, sensors: Any
+) -> None:
+    del t0
+    check(params, t1, t1, sensors)
 
 
 def check_covariances_of(

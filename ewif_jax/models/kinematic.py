@@ -96,7 +96,8 @@ def _kinematic(
         return domain.scaled(domain.variance("q", q, params), spread(_interval(t0, t1)))
 
     def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
-        domain.check_variance("q", resolve(q, params))
+        if t1 > t0:
+            domain.check_variance("q", resolve(q, params))
         check_seen(params, t0, t1, sensors)
 
     linear = None

@@ -67,8 +67,8 @@ class Model(FromRecipe, _Model):
     linear: the matrices if the model is linear
     sensors: how many there are, if known
     steps: how time is counted if the model is discrete (what is between two steps is NaN)
-    check: check(params, t0, t1, sensors) refuses known parameters that make no covariances; None:
-        process_cov and measurement_cov are looked at
+    check: check(params, t0, t1, sensors) refuses known parameters that make no covariances, Q only
+        if t1 > t0; None: process_cov and measurement_cov are looked at
     returns_well: whether motion back in time loses no digits: over long intervals it grows as a
         polynomial (kinematic motion), not exponentially
     """
@@ -133,8 +133,7 @@ def linear_model(
         checks.psd("Q", Q)
     Q = constant("Q", Q, (n, n)) if is_discrete(Q) else named(Q)
     b = constant("b", b, (n,)) if is_discrete(b) else named(b)
-    F_where, H_where = pattern_of_powers(F), pattern_of_table(H)
-    R_varies = callable(R)
+    H_given, R_varies = H, callable(R)
     H, rows = by_sensor("H", H)
     R, cols = by_sensor("R", R)
     sensors = count_sensors(rows, cols)
@@ -154,7 +153,9 @@ def linear_model(
         found = jnp.asarray(R(params, sensor, t))
         return domain.covariance("R", found) if R_varies else found
 
-    linear = Linear(moved.F, moved.b, H, F_where, H_where, moved.reversible)
+    linear = Linear(
+        moved.F, moved.b, H, pattern_of_powers(F), pattern_of_table(H_given), moved.reversible
+    )
     check = domain.check_covariances(
         process_cov if callable(Q) else None, measurement_cov if R_varies else None
     )

@@ -103,17 +103,19 @@ def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
     """The first bad stamp and its row."""
     if not bad.any():
         return ""
-    index = tuple(int(i) for i in np.argwhere(bad)[0])
-    run = f" of run {index[0]}" if len(index) > 1 else ""
-    return f"{stamps[index]:.10g} at row {max(index[-1:])}{run}"
+    place = int(np.flatnonzero(bad)[0])
+    number, row = divmod(place, np.shape(stamps)[stamps.ndim - 1])
+    run = f" of run {number}" if stamps.ndim > 1 else ""
+    return f"{stamps.ravel()[place]:.10g} at row {row}{run}"
 
 
 def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:
     """The interval before the first bad stamp, and the usual one."""
-    if not bad.any() or stamps.shape[-1] < 2:
+    if not bad.any() or np.shape(stamps)[stamps.ndim - 1] < 2:
         return ""
-    index = [int(i) for i in np.argwhere(bad)[0]]
-    series, row = stamps[tuple(index[:-1])], index[-1]
+    width = stamps.shape[stamps.ndim - 1]
+    run, row = divmod(int(np.flatnonzero(bad)[0]), width)
+    series = stamps.reshape(-1, width)[run]
     usual = float(np.median(np.diff(np.unique(series)).astype(float))) if np.ptp(series) else 0.0
     last = "" if not row else f"{series[row] - series[row - 1]:.6g} s after the row before, "
     return f" ({last}the median interval is {usual:.6g} s)"

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
@@ -12,16 +13,14 @@ from ewif_jax.types import Measurement
 
 
 @from_recipe
-def sine_model(r: float = 0.5) -> Model:
-    """A scalar that stands still, with process noise params["sigma_w"] per sample and measurement
-    variance `r`: the wrong model by which the paper tracks the sine."""
+def sine_model(r: float = 0.5, dt: float = 0.1) -> Model:
+    """A scalar that stands still, with process noise params["sigma_w"] per sample (every `dt` s)
+    and measurement variance `r`: the wrong model by which the paper tracks the sine."""
 
-    def Q(params: dict, t0: Array, t1: Array) -> Array:
-        return jnp.where(t0 == t1, 0.0, 1.0) * jnp.square(params["sigma_w"]) * jnp.ones((1, 1))
+    def Q(params: dict) -> Array:
+        return jnp.square(params["sigma_w"]) * jnp.ones((1, 1))
 
-    return linear_model(
-        F=lambda params, t0, t1: jnp.eye(1), H=jnp.eye(1), R=jnp.asarray([[r]]), Q=Q
-    )
+    return linear_model(np.eye(1), np.eye(1), r * np.eye(1), Q, dt=dt)
 
 
 def sine_signal(

@@ -11,7 +11,12 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.entry import check_covariances_of, check_span, check_times
+from ewif_jax.models.entry import (
+    check_covariances_of,
+    check_span,
+    check_times,
+    without_process_noise,
+)
 from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible, observation
 from ewif_jax.models.model import Model
 from ewif_jax.models.steps import whole_steps
@@ -75,7 +80,8 @@ def batch_wls(
     check_times(model, measurements, t0, dtype, times, in_order=False)
     check_span(model, (measurements.time, t0), times)
     stamps = measurements.time
-    check_covariances_of(model, params, stamps, stamps, measurements.sensor)
+    seen_by = without_process_noise(model)
+    check_covariances_of(seen_by, params, stamps, stamps, measurements.sensor)
     if prior is not None:
         checks.prior(prior)
         checks.psd("prior.cov", prior.cov, definite=True)

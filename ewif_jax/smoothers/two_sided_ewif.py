@@ -8,7 +8,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.models.entry import check_covariances_of, check_span, check_times
+from ewif_jax.models.entry import (
+    check_covariances_of,
+    check_span,
+    check_times,
+    without_process_noise,
+)
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.steps import whole_steps
@@ -71,7 +76,8 @@ def two_sided_ewif(
     check_times(model, measurements, t0, dtype, times, in_order=False)
     stamps = measurements.time
     check_span(model, (t0,), stamps if times is None else times)
-    check_covariances_of(model, params, stamps, stamps, measurements.sensor)
+    seen_by = without_process_noise(model)
+    check_covariances_of(seen_by, params, stamps, stamps, measurements.sensor)
     if times is not None:
         times = jnp.asarray(times, dtype)
     if prior is not None:

@@ -51,7 +51,7 @@ class Filter(NamedTuple):
 
 def filters() -> tuple[Filter, Filter]:
     """The EWIF, and the Kalman filter that the first sample starts."""
-    model = sine_model(VARIANCE)
+    model = sine_model(VARIANCE, DT)
 
     def described(name: str, estimator: Estimator, parameter: str, *rest: Any) -> Filter:
         unit = {"tau": "s", "sigma_w": "m"}[parameter]
@@ -128,7 +128,7 @@ def _smoothers(experiment: Experiment) -> None:
             batch = simulate_batch(
                 sine(dt=DT, r=VARIANCE), jax.random.split(experiment.key(4), runs)
             )
-            return two_sided.compared(sine_model(VARIANCE), taus, batch, steps=BEHIND)
+            return two_sided.compared(sine_model(VARIANCE, DT), taus, batch, steps=BEHIND)
 
     experiment.table(
         "smoothers",

@@ -1,0 +1,230 @@
+"""Models given in continuous time, discretised exactly over any interval."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from ewif_jax import checks
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.models import domain
+from ewif_jax.models.discrete import Stride, pattern_of_powers, then
+from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
+from ewif_jax.models.parameters import named
+from ewif_jax.models.sensors import Sensor, bank
+
+TERMS = 19
+"""Of each series: what is left out is below 1 / 20! where the norm of A dt is at most 1/2."""
+HALVINGS = 40
+"""How often an interval is halved, at most: enough for a norm of A dt of 5e11."""
+
+
+def from_continuous(
+    A: Any,
+    G: Any,
+    intensity: Any,
+    sensors: Sensor | Sequence[Sensor] | None = None,
+    *,
+    H: Any = None,
+    R: Any = None,
+    b: Any = None,
+) -> Model:
+    r"""The linear model of :math:`dx = (A x + b)\,dt + G\,dw` over any interval, also backwards.
+
+    .. math::
+        F = e^{A\,dt}, \quad Q = \int_0^{dt} e^{A s} G\,q\,G' e^{A' s}\,ds, \quad
+        c = \int_0^{dt} e^{A s} b\,ds
+
+    with q = `intensity`, the covariance of w per second: Van Loan (1978). The three integrals are
+    the series of the matrix exponential over a short part of the interval, which is then doubled:
+    with F, Q, c of half of it they are :math:`F F,\; F Q F' + Q,\; F c + c`. So Q is a sum of
+    positive semidefinite terms, and nothing grows as the backward exponential of Van Loan's block
+    matrix does.
+
+    Args:
+        A: (n, n) in 1/s, or a function of `params`.
+        G: (n, k), how the noise drives the state, or a function of `params`.
+        intensity: of the noise, (k, k), (k,) or a number, or a function of `params`.
+        sensors: one or several linear `Sensor`; a measurement's `sensor` chooses. Or:
+        H, R: as in `linear_model`.
+        b: a constant input per second (n,), or a function of `params`; or None.
+
+    Differentiable in A, G, intensity, b, and in the times.
+
+    Reduces to: `random_walk`, `constant_velocity` and `constant_acceleration` with white noise for
+        their A and G.
+
+    Raises:
+        ValueError: shapes that do not fit, an intensity that is not a covariance, neither or both
+            of `sensors` and `H`, `R`; a sensor that is not linear.
+    """
+    checks.require(
+        (sensors is None) != (H is None and R is None),
+        "sensors",
+        "either sensors or both H and R",
+        "both" if sensors is not None else "neither",
+    )
+    A, G, intensity, b = (
+        _given(argument, x)
+        for argument, x in (("A", A), ("G", G), ("intensity", intensity), ("b", b))
+    )
+    F_where = None
+    if isinstance(A, np.ndarray):
+        checks.shape("A", A, (len(A), len(A)))
+        F_where = pattern_of_powers(A)
+        if isinstance(G, np.ndarray):
+            checks.shape("G", G, (len(A), "k"))
+        if isinstance(b, np.ndarray):
+            checks.shape("b", b, (len(A),))
+    if isinstance(intensity, np.ndarray):
+        checks.psd("intensity", _squared_up(intensity, np))
+
+    def drift_over(params: Any, t0: Any, t1: Any) -> tuple[Array, Array]:
+        """A (n, n) in the direction of time, and the length of the interval."""
+        drift, dt = _valued(A, params), domain.floating(t1) - domain.floating(t0)
+        checks.shape("A", drift, (drift.shape[0],) * 2)
+        dtype = jnp.promote_types(drift.dtype, dt.dtype)
+        drift, dt = drift.astype(dtype), dt.astype(dtype)
+        return jnp.where(dt < 0, -drift, drift), jnp.where(dt < 0, -dt, dt)
+
+    def noise_of(params: Any, dtype: Any) -> Array:
+        drive = _valued(G, params).astype(dtype)
+        checks.shape("G", drive, ("n", "k"))
+        k = drive.shape[1]
+        q = _squared_up(_valued(intensity, params), jnp).astype(dtype)
+        q = q if isinstance(intensity, np.ndarray) else domain.covariance("intensity", q)
+        q = q * jnp.eye(k, dtype=dtype) if q.shape == (1, 1) else q
+        checks.shape("intensity", q, (k, k))
+        return matmul(matmul(drive, q), drive.T)
+
+    def F(params: Any, t0: Array, t1: Array) -> Array:
+        return integrated(*drift_over(params, t0, t1))[0]
+
+    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+        drift, dt = drift_over(params, t0, t1)
+        return integrated(drift, dt, noise=noise_of(params, drift.dtype))[1]
+
+    def gathered(params: Any, t0: Array, t1: Array) -> Array:
+        drift, dt = drift_over(params, t0, t1)
+        push = _valued(b, params).astype(drift.dtype)
+        checks.shape("b", push, drift.shape[:1])
+        return integrated(drift, dt, push=jnp.where(t1 < t0, -push, push))[2]
+
+    offset = None if b is None else gathered
+    if sensors is None:
+        seen = linear_model(F, H, R, b=offset)
+    else:
+        observe, cov, residual, matrix, count = bank(sensors)
+        linear = None
+        if matrix is not None:
+            if callable(A):  # its size is known when it is asked
+
+                def H_of(params: Any, sensor: Array, t: Array) -> Array:
+                    size = jax.eval_shape(lambda: _valued(A, params)).shape[0]
+                    return matrix(size)[0](params, sensor, t)
+
+                linear = Linear(F, offset, H_of)
+            else:
+                H_all, H_where = matrix(len(A))
+                linear = Linear(F, offset, H_all, F_where, H_where)
+        seen = Model(
+            affine_motion(F, offset),
+            process_cov,
+            observe,
+            cov,
+            residual,
+            linear,
+            count,
+            check=domain.check_covariances(None, cov),
+        )
+    check_seen = seen.check
+
+    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+        if callable(intensity) and t1 > t0:
+            checks.psd("intensity", _squared_up(np.asarray(intensity(params)), np))
+        if check_seen is not None:
+            check_seen(params, t0, t1, sensors)
+
+    if seen.linear is not None:
+        seen = seen._replace(linear=seen.linear._replace(F_where=F_where))
+    return seen._replace(process_cov=process_cov, check=check)
+
+
+def integrated(
+    A: Array, dt: Array, noise: Array | None = None, push: Array | None = None
+) -> tuple[Array, Any, Any]:
+    """exp(A dt), and the integrals over s from 0 to dt >= 0 of exp(A s) noise exp(A s)' and of
+    exp(A s) push, where these are given."""
+    # Halved until the series is short, then doubled: with norm 1 twice, and exp(1) = exp(1/2)^2.
+    length = lax.stop_gradient(jnp.max(jnp.sum(abs(A), 0)) * dt)
+    halvings = jnp.ceil(jnp.log2(jnp.maximum(2 * length, 1)))
+    enough = halvings <= HALVINGS
+    halvings = jnp.where(enough, halvings, 0)
+    h = dt * jnp.exp2(-halvings)
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    term, total = eye, eye
+    for k in range(1, TERMS):
+        term = matmul(A, term) * (h / k)
+        total = total + term
+    first = Stride(
+        total,
+        None if push is None else _series(lambda x: matvec(A, x), push, h),
+        None if noise is None else _series(lambda x: _both_sides(A, x), noise, h),
+    )
+
+    def doubled(stride: Stride, number: Array) -> tuple[Stride, None]:
+        twice = lax.cond(number < halvings, _twice, lambda x: x, stride)
+        return twice, None
+
+    def all_doubled(stride: Stride) -> Stride:
+        return lax.scan(doubled, stride, jnp.arange(HALVINGS))[0]
+
+    found = lax.cond(halvings > 0, all_doubled, lambda x: x, first)
+    found = jax.tree.map(lambda x: jnp.where(enough, x, jnp.nan), found)
+    return found.F, found.Q, found.b
+
+
+def _series(derivative: Callable[[Array], Array], start: Array, h: Array) -> Array:
+    """The integral from 0 to h of what begins as `start` and has this (linear) derivative."""
+    term = start * h
+    total = term
+    for k in range(2, TERMS + 1):
+        term = derivative(term) * (h / k)
+        total = total + term
+    return total
+
+
+def _both_sides(A: Array, x: Array) -> Array:
+    half = matmul(A, x)
+    return half + half.T
+
+
+def _twice(stride: Stride) -> Stride:
+    return then(stride, stride, matmul, matvec)
+
+
+def _given(argument: str, value: Any) -> Any:
+    """An array of NumPy, or a function of `params`, or None; what is not finite is refused."""
+    if value is None:
+        return None
+    if callable(value):
+        return named(value)
+    if isinstance(value, Tracer):
+        return lambda params: value
+    checks.finite(argument, value)
+    return np.array(value, float)
+
+
+def _valued(value: Any, params: Any) -> Array:
+    """What it is for these parameters."""
+    return domain.floating(value(params) if callable(value) else value)
+
+
+def _squared_up(q: Any, xp: Any) -> Any:
+    """An intensity as a matrix: of a number (1, 1), of variances (k, k)."""
+    q = xp.atleast_1d(xp.asarray(q))
+    return xp.diag(q) if q.ndim == 1 else q
