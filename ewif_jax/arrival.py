@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ewif_jax.clocks import slack
 from ewif_jax.streams import cast, in_dtype
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
 class Arrival(NamedTuple):
@@ -29,12 +30,27 @@ def arrive(
     measurement = cast(measurement, state.time.dtype)
     target = jnp.maximum(state.time, measurement.time if to is None else to)
     moved = estimator.predict(params, state, target)
-    updated, info = estimator.update(params, moved, measurement)
     if to is not None:
-        return Arrival(updated, updated, info)
+        return _by_the_clock(estimator, params, state, moved, target, measurement)
+    updated, info = estimator.update(params, moved, measurement)
     present = jnp.any(measurement.mask)
     kept = jax.tree.map(lambda new, old: jnp.where(present, new, old), updated, state)
     return Arrival(kept, updated, info)
+
+
+def _by_the_clock(
+    estimator: Estimator, params: Any, state: Any, moved: Any, clock: Array, given: Measurement
+) -> Arrival:
+    """What arrives when the filter's clock shows `clock`. A stamp ahead of it (more than rounding)
+    is `REJECTED`, and the filter stays where it was; what is reported is its prediction."""
+    limit = clock + slack(jnp, given.time, clock)
+    ahead = jnp.any(given.mask) & (given.time > limit)
+    usable = given._replace(time=jnp.minimum(given.time, clock), mask=given.mask & ~ahead)
+    updated, info = estimator.update(params, moved, usable)
+    kept = jax.tree.map(lambda new, old: jnp.where(ahead, old, new), updated, state)
+    status = jnp.where(ahead, jnp.int32(Status.REJECTED), info.status)
+    delay = jnp.where(ahead, clock - given.time, info.delay)
+    return Arrival(kept, updated, info._replace(status=status, delay=delay))
 
 
 def initial(

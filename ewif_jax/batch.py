@@ -17,18 +17,16 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.estimator import Clock
+from ewif_jax.every_run import examined, per_run_flags, same_runs
 from ewif_jax.fast.compiling import WIDE, quick_jit
 from ewif_jax.fast.layout import (
     Frozen,
-    broadcast_prefix,
     device_count,
     on_devices,
-    one_run,
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
-from ewif_jax.streams import float_dtype
-from ewif_jax.trial import validated
+from ewif_jax.streams import float_dtype, given
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
 
@@ -83,91 +81,27 @@ def run_batch(
 
     Returns:
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
+
+    Raises:
+        ValueError: what `run` refuses, in any run; arguments whose numbers of runs or arrivals
+            differ; parameters with an axis of runs that is not marked.
     """
-    input_flags, complete = _examined(
+    checks.estimator(estimator)
+    params, measurements, prior, t0, times = given(
+        params, measurements, prior, t0, times, batched=True
+    )
+    input_flags, complete = examined(
         estimator, params, params_per_run, measurements, prior, t0, times, clock, key
     )
-    runs = np.shape(measurements.value)[0]
-    flags = (
-        *input_flags,
-        None if key is None else True,
-        broadcast_prefix(context_per_run, context),
-    )
-    keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
+    runs, steps = np.shape(measurements.value)[:2]
+    context_flags = per_run_flags("context", context_per_run, context)
+    same_runs("context", context, context_flags, runs, steps)
+    flags = (*input_flags, None if key is None else True, context_flags)
+    each = checks.is_typed_key(key) and key.ndim == 1
+    keys = key if key is None or each else jax.random.split(key, runs)
     count = device_count(runs, devices)
     inputs = on_devices((params, measurements, prior, times, keys, context), flags, count)
     return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, complete)
-
-
-@checks.once
-def _examined(
-    estimator: Estimator,
-    params: Any,
-    params_per_run: Any,
-    measurements: Measurement,
-    prior: Gaussian | None,
-    t0: Any,
-    times: Any,
-    clock: Clock,
-    key: Any,
-) -> tuple[Any, bool]:
-    """Which inputs differ by run, and whether it is known that nothing is masked; everything that
-    can be refused now is."""
-    checks.stream(measurements, batched=True)
-    checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
-    inputs, flags = flagged(params, params_per_run, measurements, prior, times)
-    check_runs(estimator, inputs, flags, t0, clock, key)
-    mask = checks.known(measurements.mask)
-    return flags, mask is not None and bool(mask.all())
-
-
-def _one_for_each(key: Any) -> bool:
-    """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
-    return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-
-
-def flagged(
-    params: Any, params_per_run: Any, measurements: Measurement, prior: Gaussian | None, times: Any
-) -> tuple[Any, Any]:
-    """(params, measurements, prior, times), and the same with a bool for each leaf: whether it has
-    a leading axis of runs."""
-    flags = (
-        broadcast_prefix(params_per_run, params),
-        _ranked(measurements, (1, 2, 1, 2)),
-        None if prior is None else _ranked(prior, (1, 2)),
-        None if times is None else jnp.ndim(times) == 2,
-    )
-    return (params, measurements, prior, times), flags
-
-
-def _ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
-    """Which fields of a named tuple have more axes than one run needs."""
-    return type(fields)(*(jnp.ndim(x) > rank for x, rank in zip(fields, ranks, strict=True)))
-
-
-def check_runs(
-    estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, key: Any
-) -> None:
-    """Refuses what `run` refuses, with the first run for all, the largest sensor of any run, and
-    the parameters also of the runs in which one of them is lowest."""
-    params, params_f = inputs[0], flags[0]
-    _, measurements, prior, times = one_run(inputs, flags)
-    sensors = checks.known(inputs[1].sensor)
-    if sensors is not None and sensors.ndim == 2:
-        measurements = measurements._replace(sensor=sensors.max(0))
-    for k in {0, *_lowest(params, params_f)}:
-        own = one_run(params, params_f, k)
-        validated(estimator, own, measurements, prior, t0, times, clock, key)
-
-
-def _lowest(params: Any, flags: Any) -> set[int]:
-    """Where the numbers that each run has of its own are lowest, or not numbers."""
-    numbers = [
-        checks.known(x)
-        for x, f in zip(*map(jax.tree.leaves, (params, flags)), strict=True)
-        if f and jnp.ndim(x) == 1 and jnp.issubdtype(jnp.result_type(x), jnp.number)
-    ]
-    return {int(np.argmin(x)) for x in numbers if x is not None}
 
 
 def _filtered(

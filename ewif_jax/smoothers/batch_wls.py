@@ -12,7 +12,8 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, affine_flow, need_linear, observation
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.models.sensor_range import check_sensors
+from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
 Weight = Callable[[Any, Array, Array], Array]
@@ -62,10 +63,9 @@ def batch_wls(
         model and W = 1 inside a window (5).
     """
     need_linear(model, "batch_wls")
-    checks.stream(measurements)
-    checks.sensors(measurements, model.sensors)
-    checks.shape("times", times, ("K",))
-    checks.finite("times", times)
+    params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    checks.require(times is not None, "times", "when to estimate, (K,) seconds", None)
+    check_sensors(model, params, None, measurements)
     checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
     dtype = float_dtype(measurements.value)
     if prior is not None:

@@ -9,10 +9,11 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import joined
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
 
@@ -57,13 +58,11 @@ def two_sided_ewif(
     Deviations: beyond the paper, whose smoothing (section VI-A) weights newer data above 1.
     """
     need_linear(model, "two_sided_ewif")
-    checks.stream(measurements)
-    checks.sensors(measurements, model.sensors)
+    params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    check_sensors(model, params, None, measurements)
     checks.positive("tau", resolve(tau, params))
     dtype = float_dtype(measurements.value)
     if times is not None:
-        checks.shape("times", times, ("K",))
-        checks.finite("times", times)
         times = jnp.asarray(times, dtype)
     if prior is not None:
         checks.prior(prior)
