@@ -112,11 +112,11 @@ def representable(dtype: Any, time: Any, t0: Any = None, times: Any = None) -> N
     """Refuses known times that `dtype` cannot hold.
 
     All intervals between times that follow each other (stamps of a run, t0 and report times
-    together, sorted) have to stay as they are to within a half, and nine of ten of them to within a
+    together, sorted) have to stay as they are to within a half, and 19 of 20 of them to within a
     fiftieth: in float32 the last holds up to 1.7e5 equal intervals from zero. (In a long stream of
     random times some intervals are so short that their length is of no account.) Times closer than
-    a millionth of the median interval, or than rounding in float64, are taken for the same. What
-    has that dtype already is not looked at: nobody knows what it was.
+    both a millionth of the median interval and 1e-10 of themselves, or than rounding in float64,
+    are taken for the same. What has that dtype already is not looked at: nobody knows what it was.
     """
     given = ("measurements.time", time), ("t0", t0), ("times", times)
     finer = []
@@ -149,11 +149,14 @@ def _judge(
     far = ~np.isfinite(rounded)
     expected = f"times that {dtype} can hold"
     require(not far.any(), given[0][0], expected, ordered[far].flat[0] if far.any() else None)
-    apart = before > 8 * np.finfo(float).eps * np.abs(ordered[:, 1:])
-    middle = np.nanmedian(np.where(apart, before, np.nan), axis=1) if apart.any() else np.zeros(1)
-    apart &= before > 1e-6 * np.where(np.isnan(middle), 0, middle)[:, None]
+    size = np.abs(ordered[:, 1:])
+    apart = before > 8 * np.finfo(float).eps * size
+    some = apart.any(1, keepdims=True)
+    # In a run with nothing apart any number will do.
+    middle = np.nanmedian(np.where(apart | ~some, before, np.nan), axis=1, keepdims=True)
+    apart &= before > np.minimum(1e-6 * middle, 1e-10 * size)
     share = np.where(apart, change / np.where(apart, before, 1), 0)
-    many = np.sum(share > MOST_TO, 1) > np.sum(apart, 1) / 10
+    many = np.sum(share > MOST_TO, 1) > np.sum(apart, 1) / 20
     lost = (share > ALL_TO).any(1) | many
     if not lost.any():
         return

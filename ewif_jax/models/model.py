@@ -298,6 +298,6 @@ def _count_sensors(rows: int | None, cols: int | None) -> int | None:
 def select(table: Array, index: Array) -> Array:
     """table[index] for a small table, as a product (a gather is slow in a batch)."""
     if not jnp.issubdtype(table.dtype, jnp.inexact):
-        table = table.astype(float)  # whole numbers: products are of floats
+        table = table.astype(jnp.result_type(float))  # whole numbers: products are of floats
     chosen = (jnp.arange(table.shape[0]) == index).astype(table.dtype)
     return matvec(table.reshape(table.shape[0], -1).T, chosen).reshape(table.shape[1:])
