@@ -97,8 +97,9 @@ def run_batch(
     context_flags = per_run_flags("context", context_per_run, context)
     same_runs("context", context, context_flags, runs, steps)
     flags = (*input_flags, None if key is None else True, context_flags)
-    each = checks.is_typed_key(key) and key.ndim == 1
-    keys = key if key is None or each else jax.random.split(key, runs)
+    keys = key
+    if key is not None and not (checks.is_typed_key(key) and key.ndim == 1):
+        keys = jax.random.split(key, runs)
     count = device_count(runs, devices)
     inputs = on_devices((params, measurements, prior, times, keys, context), flags, count)
     return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, complete)

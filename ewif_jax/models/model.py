@@ -297,7 +297,8 @@ def _count_sensors(rows: int | None, cols: int | None) -> int | None:
 
 def select(table: Array, index: Array) -> Array:
     """table[index] for a small table, as a product (a gather is slow in a batch)."""
-    if not jnp.issubdtype(table.dtype, jnp.inexact):
-        table = table.astype(jnp.result_type(float))  # whole numbers: products are of floats
+    # Products are of floats, and of the floats there are now, if x64 was switched since.
+    whole = not jnp.issubdtype(table.dtype, jnp.inexact)
+    table = table.astype(jnp.result_type(float if whole else table.dtype))
     chosen = (jnp.arange(table.shape[0]) == index).astype(table.dtype)
     return matvec(table.reshape(table.shape[0], -1).T, chosen).reshape(table.shape[1:])

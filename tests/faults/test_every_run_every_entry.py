@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """What is refused of one run is refused of every run, by every entry, by the name of the argument."""
 
 import re
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import ewif_jax as ej
-from ewif_jax import Gaussian, Measurement
+from ewif_jax import Gaussian, Measurement, every_run
 from ewif_jax.models import constant_velocity, position_sensor
 
 R, T = 4, 5
@@ -66,7 +67,7 @@ REFUSED = {
     "not a prefix": (lambda: batch(EWIF, {"tau": 1.0}, options={"params_per_run": {"q": True}}), "params_per_run: expected True, False"),
     "not marked": (lambda: batch(ej.kalman(TUNED), ALL_R), "params['r']: expected a value that all runs share"),
     "not marked, of two": (lambda: batch(ej.kalman(TUNED), {"r": np.ones(R), "q": np.ones(R)}, options={"params_per_run": {"r": True, "q": False}}), "params['q']: expected a value that all runs share"),
-    "a bad one, deeper": (lambda: batch(ej.ewif(MODEL, lambda p: p["tau"][1]), {"tau": changed(np.ones((R, 2)), -1)}, options=RUNS), "tau: expected a positive"),
+    "a bad one, deeper": (lambda: batch(ej.ewif(MODEL, lambda p: p["a"]["tau"]), {"a": {"tau": changed(np.ones(R), -1)}}, options=RUNS), "tau: expected a positive"),
     "keys": (lambda: batch(ENSEMBLE, options={"key": keys(3)}), "key: expected a PRNG key"),
     "an int for a key": (lambda: batch(ENSEMBLE, options={"key": 0}), "key: expected a PRNG key"),
     "context": (lambda: batch(options=CONTEXT), "context: expected 5 arrivals"),
@@ -86,6 +87,16 @@ def test_refused_by_name(name):
     attempt, message = REFUSED[name]
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         attempt()
+
+
+def test_the_runs_that_are_tried_have_the_lowest_number_or_eigenvalue_anywhere():
+    def tried(x, run, value):
+        return every_run.lowest(changed(x, value, run), True)
+
+    assert 3 in tried(np.ones((R, 2, 3)), 3, -1)
+    assert 1 in tried(np.ones((R, 2)), 1, np.nan)
+    assert 2 in tried(np.ones((R, 2)), 2, np.inf)
+    assert 2 in tried(COV, 2, [[1, 2], [2, 1]])
 
 
 def test_no_entry_clamps_a_sensor():

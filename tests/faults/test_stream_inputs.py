@@ -1,4 +1,7 @@
-"""What is given as values, sensors, masks and parameters is used as it is meant, or refused by name."""
+# ruff: noqa: E501
+"""Values, sensors, masks and parameters are used as they are meant, or refused by name."""
+
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +13,15 @@ from ewif_jax import Gaussian, Measurement
 from ewif_jax.models import constant_velocity, position_sensor
 from ewif_jax.scenarios.delays import deliver
 
-MODEL = constant_velocity(
-    sensors=[position_sensor(lambda p: p["r"]), position_sensor(lambda p: 2 * p["r"])], q=1.0
-)
-KALMAN = ej.kalman(MODEL)
+
+@cache
+def kalman(double):
+    """One filter for each precision: a model's constants are made when it is built."""
+    del double
+    sensors = [position_sensor(lambda p: p["r"]), position_sensor(lambda p: 2 * p["r"])]
+    return ej.kalman(constant_velocity(sensors=sensors, q=1.0))
+
+
 PRIOR = Gaussian(np.array([0.0, 1.0]), np.array([[2.0, 0.5], [0.5, 1.0]]))
 PLAIN = Measurement(
     np.arange(1.0, 4), np.array([[1.0], [3.0], [2.0]]), np.array([0, 1, 0]), np.ones((3, 1), bool)
@@ -64,7 +72,8 @@ def test_what_is_missing_is_masked():
 
 def last(measurements=PLAIN, prior=PRIOR, params=None, t0=0.0):
     params = {"r": 1.0} if params is None else params
-    return np.asarray(ej.run(KALMAN, params, measurements, prior=prior, t0=t0).mean[-1])
+    estimator = kalman(jax.config.values["jax_enable_x64"])
+    return np.asarray(ej.run(estimator, params, measurements, prior=prior, t0=t0).mean[-1])
 
 
 def big(x):
@@ -87,7 +96,7 @@ def test_other_byte_orders_and_numbers_are_the_same_data():
     np.testing.assert_array_equal(last(ej.stream(frame.t, frame.z, frame.s, frame.m)), want)
     batch = PLAIN._replace(value=big(np.stack([PLAIN.value] * 2)))
     prior = Gaussian(*map(big, PRIOR))
-    many = ej.run_batch(KALMAN, {"r": np.ones(2, ">f8")}, batch, prior=prior, t0=0.0, params_per_run=True)  # fmt: skip
+    many = ej.run_batch(kalman(True), {"r": np.ones(2, ">f8")}, batch, prior=prior, t0=0.0, params_per_run=True)  # fmt: skip
     np.testing.assert_allclose(many.mean[:, -1], [want, want], rtol=1e-12)
 
 

@@ -1,4 +1,5 @@
-"""Times: what is given in other units or clocks becomes seconds, what a dtype cannot hold is refused."""
+# ruff: noqa: E501
+"""Times: other units and clocks become seconds, what a dtype cannot hold is refused."""
 
 from datetime import UTC, datetime, timedelta, timezone
 
