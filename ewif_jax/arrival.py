@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ewif_jax.clocks import slack
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, in_dtype
@@ -100,8 +101,7 @@ def _place(
         now = jnp.where(in_step, now, start)
         refused = ~in_step | ~whole_steps(steps, now, stamp)
     if by_clock:
-        rounding = 4 * jnp.finfo(stamp.dtype).eps * jnp.maximum(jnp.abs(stamp), jnp.abs(now))
-        ahead = stamp > now + rounding
+        ahead = stamp > now + slack(jnp, stamp, now)
         refused = ahead if refused is None else refused | ahead
     return now, refused
 

@@ -13,25 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.core import Tracer
 
 from ewif_jax import checks
-from ewif_jax.arrival import Screened, arrive, initial, marked, screen
+from ewif_jax.arrival import arrive, initial, marked, screen
 from ewif_jax.estimator import Clock
+from ewif_jax.every_run import Content, examined, per_run_flags, same_runs
 from ewif_jax.fast.compiling import WIDE, quick_jit
 from ewif_jax.fast.layout import (
     Frozen,
-    broadcast_prefix,
     device_count,
     on_devices,
-    one_run,
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
-from ewif_jax.fast.memo import once
-from ewif_jax.models.entry import check_times
-from ewif_jax.streams import float_dtype
-from ewif_jax.trial import validated
+from ewif_jax.streams import float_dtype, given
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
 
@@ -86,126 +81,31 @@ def run_batch(
 
     Returns:
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
+
+    Raises:
+        ValueError: what `run` refuses, in any run; arguments whose numbers of runs or arrivals
+            differ; parameters with an axis of runs that is not marked.
     """
-    input_flags, content, sifted = _examined(
+    checks.estimator(estimator)
+    params, measurements, prior, t0, times = given(
+        params, measurements, prior, t0, times, batched=True
+    )
+    input_flags, content, sifted = examined(
         estimator, params, params_per_run, measurements, prior, t0, times, clock, key
     )
     measurements, refused = sifted or (measurements, None)
-    runs = np.shape(measurements.value)[0]
-    flags = (
-        *input_flags,
-        None if key is None else True,
-        (broadcast_prefix(context_per_run, context), None if refused is None else True),
-    )
-    keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
+    runs, steps = np.shape(measurements.value)[:2]
+    context_flags = per_run_flags("context", context_per_run, context)
+    same_runs("context", context, context_flags, runs, steps)
+    seen_flags = (context_flags, None if refused is None else True)
+    flags = (*input_flags, None if key is None else True, seen_flags)
+    keys = key
+    if key is not None and not (checks.is_typed_key(key) and key.ndim == 1):
+        keys = jax.random.split(key, runs)
     count = device_count(runs, devices)
     inputs = (params, measurements, prior, times, keys, (context, refused))
     inputs = on_devices(inputs, flags, count)
     return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, content)
-
-
-class Content(NamedTuple):
-    """What is known of the values of a batch before anything is compiled."""
-
-    complete: bool
-    """Nothing is masked, which the compiled program then need not look for."""
-    screened: bool
-    """What is not a number has been taken out (see `screen`)."""
-
-
-@once
-def _examined(
-    estimator: Estimator,
-    params: Any,
-    params_per_run: Any,
-    measurements: Measurement,
-    prior: Gaussian | None,
-    t0: Any,
-    times: Any,
-    clock: Clock,
-    key: Any,
-) -> tuple[Any, Content, Screened | None]:
-    """Which inputs differ by run, what is known of the values, and the measurements without what
-    is not a number if there is such; everything that can be refused now is."""
-    checks.stream(measurements, batched=True)
-    checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
-    sifted = _sifted(measurements)
-    shown = sifted.measurements if sifted else measurements
-    inputs, flags = flagged(params, params_per_run, shown, prior, times)
-    check_runs(estimator, inputs, flags, t0, clock, key)
-    mask = checks.known(shown.mask)
-    complete = mask is not None and bool(mask.all())
-    return flags, Content(complete, _values_at_hand(measurements)), sifted
-
-
-def _values_at_hand(measurements: Measurement) -> bool:
-    return not any(isinstance(x, Tracer) for x in measurements)
-
-
-def _sifted(measurements: Measurement) -> Screened | None:
-    """The measurements at hand without what is not a number; None if all are numbers. Only a batch
-    in which some are not pays for a mask, and so a gain, for every run."""
-    dtype = float_dtype(measurements.value)
-    if not _values_at_hand(measurements):
-        return None
-    value = np.asarray(measurements.value)
-    if value.dtype == dtype and checks.squares_are_finite(measurements.value):
-        return None
-    screened = screen(jax.tree.map(np.asarray, measurements), dtype)
-    return screened if screened.refused.any() else None
-
-
-def _one_for_each(key: Any) -> bool:
-    """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
-    return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-
-
-def flagged(
-    params: Any, params_per_run: Any, measurements: Measurement, prior: Gaussian | None, times: Any
-) -> tuple[Any, Any]:
-    """(params, measurements, prior, times), and the same with a bool for each leaf: whether it has
-    a leading axis of runs."""
-    flags = (
-        broadcast_prefix(params_per_run, params),
-        _ranked(measurements, (1, 2, 1, 2)),
-        None if prior is None else _ranked(prior, (1, 2)),
-        None if times is None else jnp.ndim(times) == 2,
-    )
-    return (params, measurements, prior, times), flags
-
-
-def _ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
-    """Which fields of a named tuple have more axes than one run needs."""
-    return type(fields)(*(jnp.ndim(x) > rank for x, rank in zip(fields, ranks, strict=True)))
-
-
-def check_runs(
-    estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Clock, key: Any
-) -> None:
-    """Refuses what `run` refuses, with the first run for all, the largest sensor of any run, and
-    the parameters also of the runs in which one of them is lowest."""
-    params, params_f = inputs[0], flags[0]
-    dtype = float_dtype(inputs[1].value)
-    check_times(estimator.model, inputs[1], t0, dtype, inputs[3])
-    _, measurements, prior, times = one_run(inputs, flags)
-    sensors = checks.known(inputs[1].sensor)
-    if sensors is not None and sensors.ndim == 2:
-        measurements = measurements._replace(sensor=sensors.max(0))
-    one_key = key[0] if key is not None and _one_for_each(key) else key
-    for k in {0, *_lowest(params, params_f)}:
-        own = one_run(params, params_f, k)
-        validated(estimator, own, measurements, prior, t0, times, clock, one_key)
-
-
-def _lowest(params: Any, flags: Any) -> set[int]:
-    """Where the numbers that each run has of its own are lowest, or not numbers."""
-    numbers = [
-        checks.known(x)
-        for x, f in zip(*map(jax.tree.leaves, (params, flags)), strict=True)
-        if f and jnp.ndim(x) == 1 and jnp.issubdtype(jnp.result_type(x), jnp.number)
-    ]
-    finite = [np.where(np.isfinite(x), x, -np.inf) for x in numbers if x is not None]
-    return {int(np.argmin(x)) for x in finite}
 
 
 def _filtered(

@@ -7,11 +7,13 @@ argument, what was expected and what came.
 from functools import lru_cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement
 
 SMALL = 800
 """Bytes of matrices whose eigenvalues are kept: working them out again takes as long as filtering
@@ -24,8 +26,9 @@ def known(x: Any) -> np.ndarray | None:
 
 
 def with_dtype(x: Any) -> Any:
-    """`x` if it has a dtype, else (numbers, lists) as a NumPy array."""
-    return x if hasattr(x, "dtype") else np.asarray(x)
+    """`x` if it is an array, else (numbers, lists, columns of tables) as a NumPy array."""
+    arrays = Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
+    return x if isinstance(x, arrays) else np.asarray(x)
 
 
 def require(condition: Any, argument: str, expected: str, got: Any) -> None:
@@ -155,9 +158,33 @@ def needs_prior(prior: Gaussian | None, method: str) -> Gaussian:
 
 
 def needs_key(key: Any, method: str) -> Any:
-    """Refuses a missing PRNG key."""
+    """Refuses a missing PRNG key, and what is none."""
     require(key is not None, "key", f"a PRNG key (jax.random.key(0)): {method} draws noise", None)
+    random_key(key)
     return key
+
+
+def is_typed_key(x: Any) -> bool:
+    """Whether these are keys of `jax.random.key`; those of PRNGKey are rows of two numbers."""
+    return isinstance(x, Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def random_key(key: Any, runs: int | None = None) -> None:
+    """Refuses what is not a PRNG key, nor (with `runs`) typed keys, one for each run."""
+    if key is None:
+        return
+    each = "" if runs is None else f", or {runs} typed keys (jax.random.split(key, {runs}))"
+    raw = isinstance(key, Array | np.ndarray) and key.dtype == np.uint32 and key.ndim == 1
+    ok = raw or (is_typed_key(key) and key.shape in ((), () if runs is None else (runs,)))
+    got = f"{key.dtype} of shape {key.shape}" if isinstance(key, Array | np.ndarray) else Shown(key)
+    require(ok, "key", f"a PRNG key (jax.random.key(0)){each}", got)
+
+
+def estimator(estimator: Any) -> None:
+    """Refuses what is not an estimator."""
+    ok = isinstance(estimator, Estimator)
+    got = f"a {type(estimator).__name__}"
+    require(ok, "estimator", "an Estimator (kalman(model), ewif(model, tau), ...)", got)
 
 
 def stream(measurements: Measurement, batched: bool = False) -> None:
@@ -174,8 +201,12 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:
         short = batched and np.ndim(x) == 1 + len(tail)
         shape(argument, x, (*(("T",) if short else lead), *tail))
+        each = short or not batched or np.shape(x)[0] == runs
+        require(each, argument, f"{runs} runs", np.shape(x)[:1])
 
+    runs = np.shape(value)[0] if np.ndim(value) else 0
     fits("measurements.value", value, ("m",))
+    require(not batched or runs > 0, "measurements", "at least one run", "no runs")
     steps, m = np.shape(value)[-2:]
     require(steps > 0, "measurements", "at least one measurement", "an empty stream")
     for argument, x, tail in (("time", time, ()), ("sensor", sensor, ()), ("mask", mask, (m,))):
@@ -189,7 +220,9 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     finite("measurements.value", value, mask, " where mask is True (mask out what is missing)")
     seen_sensor = known(sensor)
     if seen_sensor is not None:
-        require(seen_sensor.min() >= 0, "measurements.sensor", "indices >= 0", seen_sensor.min())
+        low, high = seen_sensor.min(), seen_sensor.max()
+        require(low >= 0, "measurements.sensor", "indices >= 0", low)
+        require(high < 2**31, "measurements.sensor", "indices that fit into int32", high)
 
 
 def sensor(argument: str, index: int, count: int | None) -> None:
@@ -207,30 +240,18 @@ def sensors(measurements: Measurement, count: int | None) -> None:
         sensor("measurements.sensor", int(indices.max()), count)
 
 
-def resolvable(times: Any, dtype: Any) -> None:
-    """Refuses known times that `dtype` cannot tell apart (epoch seconds in float32)."""
-    value = known(times)
-    if value is None or value.dtype.kind != "f" or value.dtype == dtype or value.size < 2:
-        return
-    rounded = value.astype(dtype).astype(value.dtype)
-    merged = (np.diff(value) != 0) & (np.diff(rounded) == 0)
-    require(
-        not merged.any(),
-        "measurements.time",
-        f"times that {np.dtype(dtype)} can tell apart (subtract the first time, or use float64)",
-        f"distinct times near {value.max():.17g} that round to the same number",
-    )
-
-
 def report_times(times: Any, steps: int) -> None:
     """Refuses report times of the wrong length, not finite, or running backwards."""
-    shape("times", times, (steps,))
+    shape("times", times, (steps,) if np.ndim(times) < 2 else ("R", steps))
     finite("times", times)
     value = known(times)
     if value is not None:
-        back = np.argwhere(np.diff(value) < 0)
-        got = None if not back.size else f"{value[back[0, 0] + 1]} after {value[back[0, 0]]}"
-        require(back.size == 0, "times", "report times that do not decrease", got)
+        back = np.diff(value) < 0
+        place = (*np.argwhere(back)[0],) if back.any() else ()
+        later = (*place[:-1], place[-1] + 1) if place else ()
+        run = f" in run {place[0]}" if len(place) > 1 else ""
+        got = f"{value[later]} after {value[place]}{run}" if place else None
+        require(not place, "times", "report times that do not decrease", got)
 
 
 def _is_numeric(value: np.ndarray) -> bool:

@@ -10,7 +10,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
 from ewif_jax.models.entry import check_times
-from ewif_jax.streams import checked_stream, float_dtype
+from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
@@ -74,9 +74,9 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    checked_stream(measurements)
+    checks.estimator(estimator)
+    params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
-    measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = prior_in(prior, float_dtype(measurements.value))
     filtered = _compiled(measurements.time.shape[0], state, key)
     return filtered(estimator, params, measurements, prior, t0, times, clock, key)

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ewif_jax import checks
+from ewif_jax import checks, clocks
 from ewif_jax.arrival import arrive, initial
+from ewif_jax.checks import Shown
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.models.entry import check_covariances_of, check_times
@@ -26,19 +27,20 @@ def validated(
     clock: str,
     key: Any,
 ) -> Any:
-    """The shapes of the estimator's state, after everything else than the stream that can be known
-    now has been checked."""
+    """The shapes of the estimator's state, after everything that can be known now of what
+    `streams.given` returned has been checked."""
     checks.prior(prior)
-    checks.shape("t0", t0, ())
-    checks.finite("t0", t0)
+    checks.require(t0 is not None, "t0", "the time of the prior in seconds", None)
     checks.require(clock in ("validity", "arrival"), "clock", "'validity' or 'arrival'", clock)
     needs_times = clock == "arrival" and times is None
     checks.require(not needs_times, "times", "arrival times, since clock='arrival'", None)
+    checks.random_key(key)
     dtype = float_dtype(measurements.value)
-    checks.resolvable(measurements.time, dtype)
     if times is not None:
         checks.report_times(times, np.shape(measurements.time)[0])
     check_times(estimator.model, measurements, t0, dtype, times)
+    if clock == "arrival":
+        clocks.not_ahead(dtype, measurements.time, measurements.mask, times, t0)
     sensors = checks.known(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
@@ -50,7 +52,10 @@ def validated(
         one = jax.tree.map(lambda x: jnp.asarray(x)[0], cast(measurements, dtype))
         if last is not None:  # a known index is checked where the model is asked about it
             one = one._replace(sensor=last)
-        return arrive(estimator, given, state, one, None if times is None else times[0]).kept
+        to = None if times is None else jnp.asarray(times, dtype)[0]
+        kept = arrive(estimator, given, state, one, to).kept
+        _require_same_shapes(state, kept)
+        return kept
 
     shapes = np.shape(measurements.value), times is None, clock
     setting = str(dtype), key is None, bool(jax.config.jax_enable_x64)  # pyright: ignore
@@ -68,6 +73,15 @@ def validated(
         return jax.eval_shape(first)
 
     return remembered(question, tried)
+
+
+def _require_same_shapes(before: Any, after: Any) -> None:
+    """Refuses what a step leaves in other shapes: a parameter that is an array where a number was
+    meant."""
+    old, new = (jax.tree.map(jnp.shape, x) for x in (before, after))
+    same = jax.tree.structure(before) == jax.tree.structure(after) and old == new
+    expected = f"values with which a step keeps the shapes of the state, {old}"
+    checks.require(same, "params", expected, Shown(new))
 
 
 def _indexable(x: Any) -> Any:

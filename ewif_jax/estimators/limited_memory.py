@@ -63,8 +63,9 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         del key
         checks.positive("window", resolve(window, params))
         start = form.start(model, params, prior, t0)
+        # As an argument: a table of NumPy cannot be indexed while tracing.
         m = jax.eval_shape(
-            lambda: jnp.asarray(linear.H(params, jnp.zeros((), jnp.int32), start.time))
+            lambda own: jnp.asarray(linear.H(own, jnp.zeros((), jnp.int32), start.time)), params
         ).shape[0]
         buffer = Measurement(
             jnp.full(capacity, -jnp.inf, start.time.dtype),

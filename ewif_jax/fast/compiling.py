@@ -14,6 +14,7 @@ from jax.errors import JaxRuntimeError
 from jax.extend.core import get_opaque_trace_state
 
 from ewif_jax import checks
+from ewif_jax.plain import native
 
 QUICK: Mapping[str, Any] = {
     "xla_cpu_use_fusion_emitters": False,
@@ -106,7 +107,7 @@ def array(x: Any, dtype: Any = None) -> jax.Array:
     """`x` as an array of JAX. Of an array of NumPy `jnp.asarray` makes it with a program, compiled
     for every shape; this makes it with none."""
     if isinstance(x, np.ndarray):
-        return jax.device_put(np.array(x, dtype))  # of a copy, which nobody else can change
+        return jax.device_put(np.array(native(x), dtype))  # of a copy, which nobody else can change
     return jnp.asarray(x, dtype)
 
 

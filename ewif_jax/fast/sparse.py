@@ -40,7 +40,8 @@ def terms(where: Pattern) -> Terms:
     t = np.arange(max(int(count.max(initial=0)), 1))[:, None]
     order = np.argsort(~flags, axis=1, kind="stable")
     counts = t < count
-    return Terms(np.where(counts, order.T[: len(t)], order[:, 0]), counts)
+    # int32, which stays what it is when x64 is switched: JAX keeps what it made of an index array.
+    return Terms(np.where(counts, order.T[: len(t)], order[:, 0]).astype(np.int32), counts)
 
 
 def full(rows: int, cols: int) -> Pattern:

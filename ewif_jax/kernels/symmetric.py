@@ -25,7 +25,8 @@ def order(packed: Array) -> int:
 def places(n: int) -> np.ndarray:
     """Where element (i, j) is stored, (n, n)."""
     rows, cols = np.triu_indices(n)
-    where = np.zeros((n, n), int)
+    # int32, which stays what it is when x64 is switched: JAX keeps what it made of an index array.
+    where = np.zeros((n, n), np.int32)
     where[rows, cols] = where[cols, rows] = np.arange(rows.size)
     return where
 

@@ -135,7 +135,8 @@ def _matrices(order: int, dims: int, noise: str) -> tuple[Function, Function, Pa
 def _monomials(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Function:
     """dt () -> coefficient dt^power, element by element, the same in every dimension."""
     coefficient = np.kron(coefficient, np.eye(dims))
-    power = np.kron(power, np.ones((dims, dims), int))
+    # JAX keeps what it made of an index array, so it must not be made anew when x64 is switched.
+    power = np.kron(power, np.ones((dims, dims), int)).astype(np.int32)
 
     def matrix(dt: Array) -> Array:
         powers = [jnp.ones_like(dt)]

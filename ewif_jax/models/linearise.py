@@ -85,11 +85,16 @@ def size(model: Model, params: Any, t0: Any) -> int:
     return jax.eval_shape(lambda: jnp.asarray(linear.F(params, t0, t0))).shape[0]
 
 
+def need_model(model: Model, method: str) -> None:
+    """Refuses what is not a model, for the method that wants one."""
+    ok = isinstance(model, Model)
+    expected = f"a Model (linear_model(...), models.*) for {method}"
+    checks.require(ok, "model", expected, f"a {type(model).__name__}")
+
+
 def need_linear(model: Model, method: str) -> Linear:
     """The matrices of `model`, or an error that says which method wanted them."""
-    checks.require(
-        isinstance(model, Model), "model", "a Model (linear_model(...), models.*)", type(model)
-    )
+    need_model(model, method)
     checks.require(
         model.linear is not None,
         "model",

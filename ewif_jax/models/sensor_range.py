@@ -18,6 +18,7 @@ from ewif_jax import checks
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.models.model import Model
 from ewif_jax.recipe import digest
+from ewif_jax.types import Measurement
 
 
 def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None:
@@ -34,6 +35,15 @@ def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None
             "an index inside the tables that H and R (or observe and measurement_cov) look up",
             int(index),
         )
+
+
+def check_sensors(model: Model, params: Any, x: Any, measurements: Measurement) -> None:
+    """`check_sensor` of the largest known index of a whole stream."""
+    checks.sensors(measurements, model.sensors)
+    indices = checks.known(measurements.sensor)
+    if indices is not None and indices.size:
+        time = jnp.asarray(measurements.time).ravel()[0]
+        check_sensor(model, params, x, np.int32(indices.max()), time)
 
 
 def _inside(model: Model, index: int, inputs: tuple) -> bool:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import checks
+from ewif_jax import checks, clocks, plain
 from ewif_jax.streams import float_dtype
 from ewif_jax.types import Measurement
 
@@ -115,33 +115,37 @@ def deliver(
     `jit` and `vmap`.
 
     Args:
-        time: (T,) validity times in seconds.
-        value: (T, m).
+        time: (T,) validity times in seconds, or date-times as in `stream`.
+        value: (T, m); NaN means missing, as in `stream`.
         delay: () or (T,) seconds, >= 0.
         sensor: () or (T,) indices.
         lost: (T,) bool, what never arrives: it is masked.
-        mask: (T, m) bool, which components exist.
+        mask: (T, m) bool, which components exist; default: where `value` is finite.
 
     Reduces to: the same stream in its own order for delay 0 and increasing times.
 
     Raises:
-        ValueError: wrong shapes; a negative delay.
+        ValueError: wrong shapes; a negative delay; what `stream` refuses.
     """
-    value = jnp.asarray(value)
+    value = plain.numbers("value", value, missing=True)
     checks.shape("value", value, ("T", "m"))
     steps = value.shape[0]
     dtype = float_dtype(value)
-    time = jnp.asarray(time, dtype)
+    time, _, _ = clocks.in_seconds(time, name="time")
     checks.shape("time", time, (steps,))
+    checks.finite("time", time)
+    clocks.representable(dtype, time)
+    time = jnp.asarray(time, dtype)
     checks.at_least("delay", delay, 0.0)
-    sensor = jnp.broadcast_to(jnp.asarray(sensor, jnp.int32), (steps,))
-    mask = jnp.ones(value.shape, bool) if mask is None else jnp.asarray(mask)
+    sensor = jnp.broadcast_to(jnp.asarray(plain.indices("sensor", sensor)), (steps,))
+    value = jnp.asarray(value, dtype)
+    mask = jnp.isfinite(value) if mask is None else jnp.asarray(plain.booleans("mask", mask))
     checks.shape("mask", mask, value.shape)
     if lost is not None:
         checks.shape("lost", lost, (steps,))
-        mask = mask & ~jnp.asarray(lost)[:, None]
+        mask = mask & ~jnp.asarray(plain.booleans("lost", lost))[:, None]
     arrival = time + jnp.asarray(delay, dtype)
     order = jnp.argsort(arrival, stable=True)
-    measurements = Measurement(time, value.astype(dtype), sensor, mask)
+    measurements = Measurement(time, jnp.where(mask, value, 0), sensor, mask)
     sorted_in = jax.tree.map(lambda x: x[order], measurements)
     return Delivery(sorted_in, arrival[order], order)

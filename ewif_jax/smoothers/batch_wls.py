@@ -19,8 +19,9 @@ from ewif_jax.models.entry import (
 )
 from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible, observation
 from ewif_jax.models.model import Model
+from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
 Weight = Callable[[Any, Array, Array], Array]
@@ -71,10 +72,9 @@ def batch_wls(
     """
     need_linear(model, "batch_wls")
     need_reversible(model, "batch_wls")
-    checks.stream(measurements)
-    checks.sensors(measurements, model.sensors)
-    checks.shape("times", times, ("K",))
-    checks.finite("times", times)
+    params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    checks.require(times is not None, "times", "when to estimate, (K,) seconds", None)
+    check_sensors(model, params, None, measurements)
     checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, times, in_order=False)

@@ -11,10 +11,12 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models.entry import check_covariances_of, check_times
+from ewif_jax.models.linearise import need_model
 from ewif_jax.models.model import Model
+from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
 FORMS = ("extended", "unscented")
@@ -82,20 +84,21 @@ def rts(
 
     Deviations: (94) prints the last factor transposed.
     """
-    checks.stream(measurements)
-    checks.sensors(measurements, model.sensors)
-    prior = checks.needs_prior(prior, "rts")
+    need_model(model, "rts")
+    params, measurements, start, t0, _ = given(params, measurements, prior, t0, None)
+    prior = checks.needs_prior(start, "rts")
     checks.prior(prior)
-    checks.shape("t0", t0, ())
-    checks.finite("t0", t0)
+    checks.require(t0 is not None, "t0", "the time of the prior in seconds", None)
+    check_sensors(model, params, prior.mean, measurements)
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, in_order=False)
     check_covariances_of(model, params, t0, measurements.time, measurements.sensor)
     measurements = cast(measurements, dtype)
-    times, start = checks.known(measurements.time), checks.known(t0)
-    if times is not None and start is not None:
+    times, begin = checks.known(measurements.time), checks.known(t0)
+    if times is not None and begin is not None:
         early = float(times.min())
-        checks.require(early >= start, "measurements.time", f"times from t0 = {start} on", early)
+        begin = begin.astype(dtype)
+        checks.require(early >= begin, "measurements.time", f"times from t0 = {begin} on", early)
     checks.require(form in FORMS, "form", f"one of {FORMS}", repr(form))
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if form == "unscented" else None
     prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))

@@ -16,11 +16,12 @@ from ewif_jax.models.entry import (
 )
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import joined
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
 
@@ -66,13 +67,10 @@ def two_sided_ewif(
     """
     need_linear(model, "two_sided_ewif")
     need_reversible(model, "two_sided_ewif")
-    checks.stream(measurements)
-    checks.sensors(measurements, model.sensors)
+    params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    check_sensors(model, params, None, measurements)
     checks.positive("tau", resolve(tau, params))
     dtype = float_dtype(measurements.value)
-    if times is not None:
-        checks.shape("times", times, ("K",))
-        checks.finite("times", times)
     check_times(model, measurements, t0, dtype, times, in_order=False)
     stamps = measurements.time
     check_span(model, (t0,), stamps if times is None else times)

@@ -1,0 +1,131 @@
+"""Ordinary arrays of numbers from what people have: other byte orders, lists, columns of tables."""
+
+from numbers import Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import keystr, tree_map_with_path
+
+from ewif_jax import checks
+from ewif_jax.checks import Shown, require
+
+
+def native(x: Any) -> Any:
+    """`x` in the byte order of this machine: JAX reads the bytes of any other array as they lie."""
+    if isinstance(x, np.ndarray | np.generic) and not x.dtype.isnative:
+        return x.astype(x.dtype.newbyteorder("="))
+    return x
+
+
+def numbers(argument: str, x: Any, missing: bool = False) -> Any:
+    """`x` as an array of real numbers: an array of JAX as it is, all else as NumPy's, whole numbers
+    as float64 (JAX would cut them to 32 bits).
+
+    Args:
+        argument: its name in messages.
+        x: arrays, lists, columns of tables.
+        missing: whether None may stand for what is missing: it becomes NaN.
+
+    Raises:
+        ValueError: complex numbers, words, booleans, date-times, masked elements.
+    """
+    if isinstance(x, Array):
+        require(_real(x.dtype), argument, "real numbers", x.dtype)
+        return x
+    require_unmasked(argument, x)
+    value = np.asarray(x)
+    if value.dtype.kind == "O":
+        good = (Real, type(None)) if missing else Real
+        strangers = [e for e in value.ravel() if not isinstance(e, good) or isinstance(e, bool)]
+        require(not strangers, argument, "real numbers", Shown(next(iter(strangers), None)))
+        return value.astype(float)
+    require(_real(value.dtype), argument, "real numbers", value.dtype if value.ndim else Shown(x))
+    longer = value.dtype.kind in "iu" or value.dtype == np.longdouble
+    return value.astype(float) if longer else native(value)
+
+
+def indices(argument: str, x: Any) -> Any:
+    """`x` as int32 indices, NumPy's unless it is an array of JAX.
+
+    Raises:
+        ValueError: fractions, negative numbers, numbers beyond int32, what is not a number.
+    """
+    if isinstance(x, Array):
+        require(jnp.issubdtype(x.dtype, jnp.integer), argument, "whole numbers", x.dtype)
+    value = checks.known(x)
+    if value is None:
+        return x.astype(np.int32)
+    value = value if value.dtype.kind in "iu" else numbers(argument, x)
+    whole = np.isfinite(value) & (value == np.floor(value))
+    require(whole.all(), argument, "whole numbers", Shown(_first(value, ~whole)))
+    inside = (value >= 0) & (value <= np.iinfo(np.int32).max)
+    expected = "indices >= 0 that fit into int32"
+    require(inside.all(), argument, expected, Shown(_first(value, ~inside)))
+    return x.astype(np.int32) if isinstance(x, Array) else value.astype(np.int32)
+
+
+def booleans(argument: str, x: Any) -> Any:
+    """`x` as booleans, NumPy's unless it is an array of JAX; whole numbers 0 and 1 will do.
+
+    Raises:
+        ValueError: words, fractions, NaN, other numbers.
+    """
+    if isinstance(x, Array):
+        require(x.dtype == bool, argument, "booleans", x.dtype)
+        return x
+    require_unmasked(argument, x)
+    value = np.asarray(x)
+    if value.dtype.kind == "O":
+        strangers = [e for e in value.ravel() if not isinstance(e, bool | np.bool_)]
+        require(not strangers, argument, "booleans", Shown(next(iter(strangers), None)))
+    elif value.dtype != bool:
+        require(value.dtype.kind in "iu", argument, "booleans", value.dtype)
+        odd = (value != 0) & (value != 1)
+        require(not odd.any(), argument, "booleans (or 0 and 1)", Shown(_first(value, odd)))
+    return value.astype(bool)
+
+
+def parameters(params: Any) -> Any:
+    """`params` with every array that is not one of JAX as NumPy has it, in native byte order.
+
+    Raises:
+        ValueError: a leaf of words, date-times, objects or masked elements, by its name.
+    """
+    return tree_map_with_path(_parameter, params)
+
+
+def _parameter(path: Any, x: Any) -> Any:
+    if isinstance(x, Array | float | int):
+        return x
+    require_unmasked(f"params{keystr(path)}", x)
+    value = np.asarray(x)
+    good = value.dtype.kind not in "OUSMm"
+    require(good, f"params{keystr(path)}", "numbers", Shown(x))
+    narrow = value.dtype.kind in "iu" and not jax.config.jax_enable_x64  # pyright: ignore
+    if narrow and value.size:
+        largest = max(abs(int(value.max())), abs(int(value.min())))
+        fits = largest <= np.iinfo(np.int32).max
+        require(fits, f"params{keystr(path)}", "whole numbers that fit into int32", largest)
+    return native(value)
+
+
+def require_unmasked(argument: str, x: Any) -> None:
+    """Refuses a masked array with something masked in it."""
+    hidden = isinstance(x, np.ma.MaskedArray) and np.ma.is_masked(x)
+    require(
+        not hidden,
+        argument,
+        "an array without masked elements (`stream` takes masked values and masks them)",
+        "a masked array",
+    )
+
+
+def _real(dtype: Any) -> bool:
+    return jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
+
+
+def _first(value: np.ndarray, bad: np.ndarray) -> Any:
+    return value[bad].flat[0].item() if bad.any() else None
