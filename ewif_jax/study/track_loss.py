@@ -64,8 +64,8 @@ LOSSES: dict[str, tuple[scores.Score, Cost, Callable[[Array], Array]]] = {
 def loss(
     kind: str, method: Method, measurements: Measurement, counted: np.ndarray
 ) -> Callable[[Any], Array]:
-    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T); those that
-    the filter does not predict are charged."""
+    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T); those
+    that the filter does not predict are charged."""
     score, cost, finish = LOSSES[kind]
     setting = {"prior": method.prior, "t0": 0.0}
     charging = value_charging(method.estimator, measurements, cost, "charge", setting)
