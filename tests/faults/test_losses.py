@@ -104,7 +104,10 @@ def test_losing_a_row_is_never_rewarded():
 
     short, long = (both(np.concatenate([TIME, gap + TIME])) for gap in (100.0, 1000.0))
     charge = (VALUE[-1] - value.mean()) ** 2
-    np.testing.assert_allclose(long[0] ** 2 - short[0] ** 2, charge / (2 * T - 1), rtol=1e-3)
+    weight = np.exp((TIME - TIME[-1]) / 0.5)
+    predicted = (VALUE[-1] - weight @ VALUE / weight.sum()) ** 2
+    wanted = (charge - predicted) / (2 * T - 1)
+    np.testing.assert_allclose(long[0] ** 2 - short[0] ** 2, wanted, rtol=1e-6)
     np.testing.assert_allclose(long[1], short[1], rtol=1e-3)
 
 
