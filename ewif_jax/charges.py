@@ -68,11 +68,12 @@ def truth_charges(truth: Any, measurements: Measurement, unknowns: int) -> Any:
     is_given = xp.isfinite(truth).all(-1)
     filled = xp.where(is_given[..., None], truth, 0)
     mean = filled.sum(axes) / xp.maximum(is_given.sum(), 1)
-    charge = xp.square(filled - mean).sum(-1)
+    charge = xp.square(filled - xp.broadcast_to(mean, filled.shape)).sum(-1)
     measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)
-    return _in_dtype(
-        xp.where(is_given & (measured >= unknowns), charge, xp.nan), measurements.value
-    )
+    shape = np.broadcast_shapes(is_given.shape, measured.shape)
+    is_given, measured, charge = (xp.broadcast_to(x, shape) for x in (is_given, measured, charge))
+    counted = is_given & (measured >= unknowns)
+    return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
 def squared_cost(error: Any, spread: Any, present: Any) -> Any:

@@ -29,6 +29,7 @@ RANKS = (
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},
     {"scores", "continuous", "charges"},
+    {"charging"},
     {"losses", "transforms"},
     {"tuning", "monte_carlo"},
     {"scenarios"},

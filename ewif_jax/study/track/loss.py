@@ -12,7 +12,7 @@ from ewif_jax import scores
 from ewif_jax.analysis.consistency import nis
 from ewif_jax.batch import Step, run_batch
 from ewif_jax.charges import Cost, density_cost, length_cost, squared_cost
-from ewif_jax.losses import value_charging
+from ewif_jax.charging import value_charging
 from ewif_jax.scores import average
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.track.method import Method
