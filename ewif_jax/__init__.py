@@ -4,7 +4,7 @@ A model of the world (`linear_model`, `models`), an estimator (`ewif`, `kalman`,
 of measurements in arrival order go into `run`; `monte_carlo` and `tune` build on it.
 """
 
-from ewif_jax import models, scenarios, scores
+from ewif_jax import losses, models, scenarios, scores, transforms
 from ewif_jax.analysis.anderson import (
     actual_error,
     error_bounds,
@@ -46,6 +46,14 @@ from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
+from ewif_jax.losses import (
+    likelihood_loss,
+    log_likelihood,
+    nees_loss,
+    nis_loss,
+    prediction_loss,
+    rmse_loss,
+)
 from ewif_jax.models import Model, linear_model
 from ewif_jax.monte_carlo import (
     Scenario,
@@ -76,19 +84,8 @@ from ewif_jax.smoothers.rts import rts
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
 from ewif_jax.streams import stream
-from ewif_jax.tuning import (
-    Transform,
-    Tuned,
-    likelihood_loss,
-    nees_loss,
-    nis_loss,
-    positive,
-    prediction_loss,
-    psd,
-    rmse_loss,
-    tune,
-    unconstrained,
-)
+from ewif_jax.transforms import Transform, positive, psd, unconstrained
+from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 __all__ = [
@@ -143,6 +140,8 @@ __all__ = [
     "likelihood_loss",
     "limited_memory",
     "linear_model",
+    "log_likelihood",
+    "losses",
     "maneuvering_index",
     "models",
     "monte_carlo",
@@ -184,6 +183,7 @@ __all__ = [
     "step",
     "storage",
     "stream",
+    "transforms",
     "tune",
     "two_sided_ewif",
     "unconstrained",

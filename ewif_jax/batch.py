@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
+from jax.core import Tracer
 
 from ewif_jax import checks
-from ewif_jax.arrival import arrive, initial
+from ewif_jax.arrival import Screened, arrive, initial, marked, screen
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.compiling import WIDE, quick_jit
 from ewif_jax.fast.layout import (
@@ -27,6 +28,8 @@ from ewif_jax.fast.layout import (
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
+from ewif_jax.fast.memo import once
+from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
@@ -84,22 +87,33 @@ def run_batch(
     Returns:
         A `Trace` whose leaves lead with R: mean (R, T, n); or the pytree of `observe`.
     """
-    input_flags, complete = _examined(
+    input_flags, content, sifted = _examined(
         estimator, params, params_per_run, measurements, prior, t0, times, clock, key
     )
+    measurements, refused = sifted or (measurements, None)
     runs = np.shape(measurements.value)[0]
     flags = (
         *input_flags,
         None if key is None else True,
-        broadcast_prefix(context_per_run, context),
+        (broadcast_prefix(context_per_run, context), None if refused is None else True),
     )
     keys = key if key is None or _one_for_each(key) else jax.random.split(key, runs)
     count = device_count(runs, devices)
-    inputs = on_devices((params, measurements, prior, times, keys, context), flags, count)
-    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, complete)
+    inputs = (params, measurements, prior, times, keys, (context, refused))
+    inputs = on_devices(inputs, flags, count)
+    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, content)
 
 
-@checks.once
+class Content(NamedTuple):
+    """What is known of the values of a batch before anything is compiled."""
+
+    complete: bool
+    """Nothing is masked, which the compiled program then need not look for."""
+    screened: bool
+    """What is not a number has been taken out (see `screen`)."""
+
+
+@once
 def _examined(
     estimator: Estimator,
     params: Any,
@@ -110,15 +124,35 @@ def _examined(
     times: Any,
     clock: Clock,
     key: Any,
-) -> tuple[Any, bool]:
-    """Which inputs differ by run, and whether it is known that nothing is masked; everything that
-    can be refused now is."""
+) -> tuple[Any, Content, Screened | None]:
+    """Which inputs differ by run, what is known of the values, and the measurements without what
+    is not a number if there is such; everything that can be refused now is."""
     checks.stream(measurements, batched=True)
     checks.shape("measurements.value", measurements.value, ("R", "T", "m"))
-    inputs, flags = flagged(params, params_per_run, measurements, prior, times)
+    sifted = _sifted(measurements)
+    shown = sifted.measurements if sifted else measurements
+    inputs, flags = flagged(params, params_per_run, shown, prior, times)
     check_runs(estimator, inputs, flags, t0, clock, key)
-    mask = checks.known(measurements.mask)
-    return flags, mask is not None and bool(mask.all())
+    mask = checks.known(shown.mask)
+    complete = mask is not None and bool(mask.all())
+    return flags, Content(complete, _values_at_hand(measurements)), sifted
+
+
+def _values_at_hand(measurements: Measurement) -> bool:
+    return not any(isinstance(x, Tracer) for x in measurements)
+
+
+def _sifted(measurements: Measurement) -> Screened | None:
+    """The measurements at hand without what is not a number; None if all are numbers. Only a batch
+    in which some are not pays for a mask, and so a gain, for every run."""
+    dtype = float_dtype(measurements.value)
+    if not _values_at_hand(measurements):
+        return None
+    value = np.asarray(measurements.value)
+    if value.dtype == dtype and checks.squares_are_finite(measurements.value):
+        return None
+    screened = screen(jax.tree.map(np.asarray, measurements), dtype)
+    return screened if screened.refused.any() else None
 
 
 def _one_for_each(key: Any) -> bool:
@@ -151,13 +185,16 @@ def check_runs(
     """Refuses what `run` refuses, with the first run for all, the largest sensor of any run, and
     the parameters also of the runs in which one of them is lowest."""
     params, params_f = inputs[0], flags[0]
+    dtype = float_dtype(inputs[1].value)
+    check_times(estimator.model, inputs[1], t0, dtype, inputs[3])
     _, measurements, prior, times = one_run(inputs, flags)
     sensors = checks.known(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
         measurements = measurements._replace(sensor=sensors.max(0))
+    one_key = key[0] if key is not None and _one_for_each(key) else key
     for k in {0, *_lowest(params, params_f)}:
         own = one_run(params, params_f, k)
-        validated(estimator, own, measurements, prior, t0, times, clock, key)
+        validated(estimator, own, measurements, prior, t0, times, clock, one_key)
 
 
 def _lowest(params: Any, flags: Any) -> set[int]:
@@ -167,7 +204,8 @@ def _lowest(params: Any, flags: Any) -> set[int]:
         for x, f in zip(*map(jax.tree.leaves, (params, flags)), strict=True)
         if f and jnp.ndim(x) == 1 and jnp.issubdtype(jnp.result_type(x), jnp.number)
     ]
-    return {int(np.argmin(x)) for x in numbers if x is not None}
+    finite = [np.where(np.isfinite(x), x, -np.inf) for x in numbers if x is not None]
+    return {int(np.argmin(x)) for x in finite}
 
 
 def _filtered(
@@ -178,9 +216,8 @@ def _filtered(
     clock: Clock,
     observe: Observer | None,
     devices: int,
-    complete: bool,
+    content: Content,
 ) -> Any:
-    """`complete`: nothing is masked, which the compiled program then need not look for."""
     params, measurements, prior, times, keys, context = inputs
     dtype = float_dtype(measurements.value)
     measurements = measurements._replace(
@@ -188,19 +225,46 @@ def _filtered(
     )
     times = None if times is None else jnp.asarray(times, dtype)
     inputs = (params, measurements, prior, times, keys, context)
-    loop = _loop(estimator, t0, clock, observe or _everything, complete, dtype)
+    loop = _loop(estimator, t0, clock, observe or _everything, content.complete, dtype)
 
     def filtered(*inputs: Any) -> Any:
         return over_runs(loop, estimator.estimate, inputs, flags.tree)
 
-    seen, state = over_devices(filtered, flags.tree, devices)(*inputs)
+    def screened(*inputs: Any) -> Any:
+        return _screened(loop, estimator, inputs, flags.tree, dtype)
+
+    run = filtered if content.screened else screened
+    seen, state = over_devices(run, flags.tree, devices)(*inputs)
     if observe is not None:
         return seen
     time, mean, cov, info = seen
     return Trace(time, mean, cov, info, state)
 
 
-_STATIC = ("estimator", "flags", "clock", "observe", "devices", "complete")
+def _screened(loop: Loop, estimator: Estimator, inputs: Any, flags: Any, dtype: Any) -> Any:
+    """The same of values that nobody has looked at. A mask for each run costs each run a gain of
+    its own, so one condition over the whole batch decides whether it is needed."""
+    params, measurements, prior, times, keys, (context, _) = inputs
+    params_f, measurements_f, prior_f, times_f, keys_f, (context_f, _) = flags
+    kept, refused = screen(measurements, dtype)
+
+    def own_masks() -> Any:
+        rows = jnp.broadcast_to(refused, measurements.value.shape[:2])
+        mask = jnp.broadcast_to(kept.mask, measurements.value.shape)
+        masked = kept._replace(mask=mask)
+        masked_f = measurements_f._replace(mask=True)
+        own = (params, masked, prior, times, keys, (context, rows))
+        own_f = (params_f, masked_f, prior_f, times_f, keys_f, (context_f, True))
+        return over_runs(loop, estimator.estimate, own, own_f)
+
+    if measurements_f.mask:
+        return own_masks()
+    return lax.cond(
+        jnp.any(refused), own_masks, lambda: over_runs(loop, estimator.estimate, inputs, flags)
+    )
+
+
+_STATIC = ("estimator", "flags", "clock", "observe", "devices", "content")
 _run_batch = quick_jit(_filtered, _STATIC, WIDE)
 
 
@@ -211,8 +275,8 @@ def _loop(
         return initial(estimator, params, prior, t0, dtype, key)
 
     def step(params: Any, state: Any, arrival: Any) -> tuple[Any, Any]:
-        measurement, time, seen = arrival
-        if complete:
+        measurement, time, (seen, refused) = arrival
+        if complete and refused is None:
             measurement = measurement._replace(mask=jnp.ones(measurement.mask.shape, bool))
         to = time if clock == "arrival" else None
         moved = arrive(estimator, params, state, measurement, to)
@@ -220,7 +284,8 @@ def _loop(
         if time is not None and clock == "validity":
             shown = estimator.predict(params, shown, time)
         mean, cov = estimator.estimate(params, shown)
-        return moved.kept, observe(Step(shown.time, mean, cov, moved.info), seen)
+        info = moved.info if refused is None else marked(moved.info, refused)
+        return moved.kept, observe(Step(shown.time, mean, cov, info), seen)
 
     return Loop(start, step)
 

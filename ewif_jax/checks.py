@@ -4,51 +4,23 @@ Every function looks only at values that are known now (not at tracers), and eve
 argument, what was expected and what came.
 """
 
-from collections.abc import Callable, Hashable
-from functools import lru_cache, wraps
+from functools import lru_cache
 from typing import Any
-from weakref import ref
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.core import Tracer
 
 from ewif_jax.types import Gaussian, Measurement
+
+SMALL = 800
+"""Bytes of matrices whose eigenvalues are kept: working them out again takes as long as filtering
+a short stream."""
 
 
 def known(x: Any) -> np.ndarray | None:
     """`x` as a NumPy array if its value is known now, else None."""
     return None if isinstance(x, Tracer) else np.asarray(x)
-
-
-def once(check: Callable[..., Any]) -> Callable[..., Any]:
-    """`check`, whose answer for the same arrays of JAX (they cannot change) and the same hashable
-    things is kept; what it refuses it refuses each time."""
-    answers: dict[Any, tuple[list[ref[Array]], Any]] = {}
-
-    @wraps(check)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        leaves, structure = jax.tree.flatten((args, kwargs))
-        arrays = [x for x in leaves if isinstance(x, Array)]
-        if not arrays or len(leaves) > 100 or not all(map(_fixed, leaves)):
-            return check(*args, **kwargs)
-        asked = structure, *[id(x) if isinstance(x, Array) else (type(x), x) for x in leaves]
-        before, answer = answers.get(asked, ([], None))
-        if not before or any(was() is not x for was, x in zip(before, arrays, strict=True)):
-            answer = check(*args, **kwargs)
-            if len(answers) >= 1000:
-                answers.clear()
-            answers[asked] = [ref(x) for x in arrays], answer
-        return answer
-
-    return call
-
-
-def _fixed(x: Any) -> bool:
-    """Whether it will stay what it is."""
-    return isinstance(x, Array | Hashable) and not isinstance(x, Tracer)
 
 
 def with_dtype(x: Any) -> Any:
@@ -91,15 +63,15 @@ def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
     value = np.asarray(x)
     got = value.dtype if value.ndim else Shown(x)
     require(_is_numeric(value), argument, "finite numbers", got)
-    asked = None if _all_finite(x) else known(mask)
+    asked = None if squares_are_finite(x) else known(mask)
     if asked is not None:
         bad = ~np.isfinite(value) & asked
         require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
 
 
-@once
-def _all_finite(x: Any) -> bool:
-    """Whether they surely are: one fast pass; but a sum of squares may also overflow."""
+def squares_are_finite(x: Any) -> bool:
+    """Whether all numbers and their squares surely are: one fast pass, of which the sum may also
+    overflow for other reasons."""
     value = np.asarray(x)
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.vdot(value, value)))
@@ -139,7 +111,8 @@ def psd(argument: str, x: Any, definite: bool = False) -> Any:
     square = value.ndim == 2 and value.shape[0] == value.shape[1]
     require(square, argument, "a square matrix", f"shape {value.shape}")
     finite(argument, value)
-    scale, skew, smallest = _spectrum(value.astype(float).tobytes(), len(value))
+    spectrum = _spectrum if value.nbytes <= SMALL else _spectrum.__wrapped__
+    scale, skew, smallest = spectrum(value.astype(float).tobytes(), len(value))
     require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")
     good = smallest > 0 if definite else smallest >= -1e-6 * scale
     require(good, argument, f"a {kind} matrix", f"smallest eigenvalue {smallest:.3g}")
@@ -187,7 +160,6 @@ def needs_key(key: Any, method: str) -> Any:
     return key
 
 
-@once
 def stream(measurements: Measurement, batched: bool = False) -> None:
     """Refuses a stream that is empty, ragged, or whose known numbers are not usable.
 

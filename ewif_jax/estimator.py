@@ -7,11 +7,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.arrival import arrive, initial, prior_in
+from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.models.entry import check_times
+from ewif_jax.streams import checked_stream, float_dtype
 from ewif_jax.trial import validated
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
 
 Clock = Literal["validity", "arrival"]
 
@@ -30,15 +31,14 @@ def step(
         params: what its parameters are read from.
         state: from `estimator.init` or an earlier `step`.
         measurement: one arrival: time (), value (m,), sensor (), mask (m,).
+
+    Raises:
+        ValueError: a known time between two steps of a discrete model.
     """
-    measurement = cast(measurement, state.time.dtype)
-    time, value, _, mask = measurement
-    when = jnp.isfinite(time)
-    good = when & jnp.all(jnp.isfinite(jnp.square(value)))
-    usable = measurement._replace(time=jnp.where(when, time, state.time), mask=mask & good)
-    arrival = arrive(estimator, params, state, usable)
-    status = jnp.where(good | ~jnp.any(mask), arrival.info.status, jnp.int32(Status.REJECTED))
-    return arrival.kept, arrival.info._replace(status=status)
+    check_times(estimator.model, measurement, state.time, state.time.dtype)
+    screened, refused = screen(measurement, state.time.dtype)
+    arrival = arrive(estimator, params, state, screened)
+    return arrival.kept, marked(arrival.info, refused)
 
 
 def run(
@@ -74,7 +74,7 @@ def run(
     Raises:
         ValueError: unusable streams, priors, times or keys, before anything is traced.
     """
-    checks.stream(measurements)
+    checked_stream(measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     measurements = Measurement(*map(checks.with_dtype, measurements))
     prior = prior_in(prior, float_dtype(measurements.value))
@@ -95,6 +95,7 @@ def _filtered(
     dtype = float_dtype(measurements.value)
     state = initial(estimator, params, prior, t0, dtype, key)
     times = None if times is None else jnp.asarray(times, dtype)
+    screened, refused = screen(measurements, dtype)
 
     def body(state: Any, arrival: tuple[Measurement, Array | None]) -> tuple[Any, tuple]:
         measurement, time = arrival
@@ -105,8 +106,8 @@ def _filtered(
         mean, cov = estimator.estimate(params, shown)
         return moved.kept, (shown.time, mean, cov, moved.info)
 
-    state, (time, mean, cov, info) = lax.scan(body, state, (measurements, times))
-    return Trace(time, mean, cov, info, state)
+    state, (time, mean, cov, info) = lax.scan(body, state, (screened, times))
+    return Trace(time, mean, cov, marked(info, refused), state)
 
 
 def _compiled(arrivals: int, state: Any, key: Any) -> Any:

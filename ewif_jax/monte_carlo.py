@@ -13,7 +13,8 @@ from ewif_jax import checks
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.dependence import dependence, traced
 from ewif_jax.fast.layout import Frozen, broadcast_prefix
-from ewif_jax.scores import Score, scored, squared_error
+from ewif_jax.recipe import FromRecipe
+from ewif_jax.scores import Score, average, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
 
@@ -29,21 +30,24 @@ class Simulation(NamedTuple):
 RUN_STEPS = 2**20
 
 
-class Scenario(NamedTuple):
-    """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
-    start (prior, t0), and the clock of `run`."""
-
+class _Scenario(NamedTuple):
     simulate: Callable[[Array], Simulation]
     prior: Gaussian | None
     t0: Any
     clock: Clock = "validity"
 
 
+class Scenario(FromRecipe, _Scenario):
+    """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
+    start (prior, t0), and the clock of `run`."""
+
+
 class Statistics(NamedTuple):
     """What a Monte Carlo study measured, for every metric by name.
 
     per_run (R,): average over the arrivals of a run; per_step (T,): average over the runs;
-    per_step_se (T,): its standard error; missing (R,): arrivals that could not be measured (NaN).
+    per_step_se (T,): its standard error; missing (R,): arrivals left out, because the metric says
+    NaN there (nothing known yet, nothing measured). What is infinite is not left out.
     """
 
     per_run: dict[str, np.ndarray]
@@ -54,14 +58,18 @@ class Statistics(NamedTuple):
     def mean(self, name: str) -> tuple[float, float]:
         """The metric's average over runs, and its standard error."""
         values = self.per_run[name]
-        values = values[np.isfinite(values)]
-        return float(values.mean()), float(values.std(ddof=1) / np.sqrt(max(values.size, 1)))
+        values = values[~np.isnan(values)].astype(float)
+        if values.size == 0:
+            return float("nan"), float("nan")
+        if values.size == 1 or not np.isfinite(values).all():
+            return float(values.mean()), float("nan")
+        return float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size))
 
     def root(self, name: str) -> tuple[float, float]:
         """The root of a mean square metric (an RMSE), and its standard error (delta method)."""
         value, error = self.mean(name)
         root = float(np.sqrt(value))
-        return root, error / (2 * root) if root else 0.0
+        return root, error / (2 * root) if root or np.isnan(error) else 0.0
 
 
 def monte_carlo(
@@ -84,7 +92,8 @@ def monte_carlo(
         params: its parameters; leaves marked in `params_per_run` have a leading axis of `runs`.
         scenario: where the runs come from.
         runs: how many.
-        key: PRNG key; run i depends on it and on i alone, not on `chunk` or `devices`.
+        key: PRNG key; run i depends on it and on i alone, not on `chunk` or `devices`. Or typed
+            keys (runs,), one for each run.
         metrics: scores by name (`ewif_jax.scores`); default {"squared_error": squared_error}.
         chunk: how many runs are in memory at once (default: at most 1024, and about a million
             arrivals together, so that memory grows neither with `runs` nor with the steps of a
@@ -94,12 +103,14 @@ def monte_carlo(
         progress: called with (runs done, runs) after each chunk.
 
     Raises:
-        ValueError: runs < 2, chunk < 1, a missing key, or what `run` refuses.
+        ValueError: runs < 2, chunk < 1, a key that is missing or is none, a metric that is no
+            score, or what `run` refuses.
     """
     runs = checks.whole("runs", runs, 2)
-    checks.needs_key(key, "monte_carlo")
+    _require_key(key, runs)
     if chunk is None:
-        steps = jax.eval_shape(scenario.simulate, key).measurements.value.shape[0]
+        first = key[0] if _one_for_each(key) else key
+        steps = jax.eval_shape(scenario.simulate, first).measurements.value.shape[0]
         parts = -(-runs // min(1024, max(RUN_STEPS // steps, 1)))
         chunk = -(-runs // parts)
     chunk = min(checks.whole("chunk", chunk, 1), runs)
@@ -112,7 +123,7 @@ def monte_carlo(
             )
     per_run: list[dict[str, np.ndarray]] = []
     missing: list[dict[str, np.ndarray]] = []
-    moments: Any = None
+    moments: dict[str, _Moments] = {}
     for begin in range(0, runs, chunk):
         count = min(chunk, runs - begin)
         # Filled up with repetitions, so that the last chunk is not compiled again.
@@ -135,25 +146,73 @@ def monte_carlo(
             devices=devices,
         )
         values = {name: x[:count] for name, x in values.items()}
-        runwise, absent, sums = jax.device_get(_summarise(_at_hand(values)))
+        runwise, absent, found = jax.device_get(_summarise(_at_hand(values)))
         per_run.append(runwise)
         missing.append(absent)
-        moments = sums if moments is None else jax.tree.map(np.add, moments, sums)
+        for name, parts in found.items():
+            added = _shifted(*(np.asarray(x, float) for x in parts))
+            moments[name] = _combined(moments[name], added) if name in moments else added
         if progress is not None:
             progress(begin + count, runs)
-    per_step, per_step_se = {}, {}
-    for name, (count, total, square) in moments.items():
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(count > 0, total / count, np.nan)
-            variance = np.maximum(square / count - mean**2, 0) * count / np.maximum(count - 1, 1)
-            per_step[name], per_step_se[name] = mean, np.sqrt(variance / count)
-    return Statistics(_join(per_run), per_step, per_step_se, _join(missing))
+    per_step = {name: found.mean for name, found in moments.items()}
+    errors = {name: _standard_error(found) for name, found in moments.items()}
+    return Statistics(_join(per_run), per_step, errors, _join(missing))
+
+
+class _Moments(NamedTuple):
+    """How many values there are at each step (T,), their mean, and the sum of the squares of what
+    they differ from it."""
+
+    count: np.ndarray
+    mean: np.ndarray
+    squares: np.ndarray
+
+
+def _combined(some: _Moments, others: _Moments) -> _Moments:
+    """The moments of both (Chan, Golub and LeVeque 1979): no squares of large numbers, whose
+    difference would be lost in rounding."""
+    count = some.count + others.count
+    safe = np.maximum(count, 1)
+    with np.errstate(invalid="ignore"):
+        apart = others.mean - some.mean
+        means = (some.count, some.mean), (others.count, others.mean)
+        mean = sum(np.where(n > 0, n * x, 0) for n, x in means) / safe
+        between = np.where(some.count * others.count > 0, apart**2, 0)
+        squares = some.squares + others.squares + between * some.count * others.count / safe
+    return _Moments(count, np.where(count > 0, mean, np.nan), squares)
+
+
+def _standard_error(found: _Moments) -> np.ndarray:
+    """Of the mean at each step (T,); NaN with fewer than two values."""
+    count = found.count
+    safe = np.maximum(count - 1, 1) * np.maximum(count, 1)
+    return np.where(count > 1, np.sqrt(found.squares / safe), np.nan)
+
+
+def _one_for_each(key: Any) -> bool:
+    """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
+    return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+
+
+def _require_key(key: Any, runs: int) -> None:
+    """Refuses what is no key: an int would be taken for one in some calls and not in others."""
+    checks.needs_key(key, "monte_carlo")
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    raw = dtype == np.uint32 and np.ndim(key) == 1
+    expected = "a PRNG key (jax.random.key(0)), or one typed key for each run"
+    checks.require(typed or raw, "key", expected, type(key).__name__ if dtype is None else dtype)
+    if typed:
+        checks.require(key.shape in ((), (runs,)), "key", expected, f"shape {key.shape}")
 
 
 @jax.jit
 def _keys(key: Array, index: Array) -> tuple[Array, Array]:
     """For each run one key to simulate it and one to filter it."""
-    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(index)
+    if _one_for_each(key):
+        keys = key[index]
+    else:
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(index)
     return keys, jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys)
 
 
@@ -161,12 +220,18 @@ def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:
     """One simulation per key, stacked on axis 0; what does not depend on the key stays shared
     (without that axis), so that filters compute with it once."""
     flags = dependence(traced(scenario.simulate, keys[0]), True)
-    return _simulate(scenario.simulate, keys, Frozen(flags))
+    # A scenario of a builder is compiled once for all that are equal; one made by hand may hold
+    # arrays, which cannot be compared.
+    source = scenario.simulate if scenario.recipe is None else scenario
+    return _simulate(source, keys, Frozen(flags))
 
 
-@partial(jax.jit, static_argnames=("simulate", "flags"))
-def _simulate(simulate: Callable[[Array], Simulation], keys: Array, flags: Frozen) -> Simulation:
+@partial(jax.jit, static_argnames=("source", "flags"))
+def _simulate(
+    source: Scenario | Callable[[Array], Simulation], keys: Array, flags: Frozen
+) -> Simulation:
     axes = jax.tree.map(lambda f: 0 if f else None, flags.tree)
+    simulate = source.simulate if isinstance(source, Scenario) else source
     return jax.vmap(simulate, out_axes=axes)(keys)
 
 
@@ -178,18 +243,30 @@ def _at_hand(values: dict[str, Array]) -> dict[str, Any]:
 
 @jax.jit
 def _summarise(values: dict[str, Array]) -> tuple[dict, dict, dict]:
-    known = jax.tree.map(jnp.isfinite, values)
-    filled = jax.tree.map(lambda x, k: jnp.where(k, x, 0), values, known)
-    count = jax.tree.map(lambda k: jnp.sum(k, 1), known)
-    runwise = jax.tree.map(
-        lambda x, c: jnp.where(c > 0, jnp.sum(x, 1) / jnp.maximum(c, 1), jnp.nan), filled, count
+    """For each metric (R, T): its average over each run, how many values were left out, and of
+    each step the sums that `_shifted` reads."""
+    is_score = jax.tree.map(lambda x: ~jnp.isnan(x), values)
+    runwise = jax.tree.map(lambda x: average(x, 1), values)
+    absent = jax.tree.map(lambda k: jnp.sum(~k, 1), is_score)
+    return runwise, absent, jax.tree.map(_sums, values, is_score)
+
+
+def _sums(values: Array, is_score: Array) -> tuple[Array, Array, Array, Array]:
+    """Of each step (T,): the count, the mean, and the sum and square sum of the distances from it
+    (the mean is rounded, so the first is not quite 0)."""
+    count, mean = jnp.sum(is_score, 0), average(values, 0)
+    apart = jnp.where(is_score, values - mean[None], 0)
+    return count, mean, jnp.sum(apart, 0), jnp.sum(jnp.square(apart), 0)
+
+
+def _shifted(count: Any, mean: Any, total: Any, square: Any) -> _Moments:
+    """The moments, from sums of distances from a rounded mean."""
+    safe = np.maximum(count, 1)
+    return _Moments(
+        count,
+        np.where(np.isfinite(total), mean + total / safe, mean),
+        np.maximum(square - total**2 / safe, 0),
     )
-    absent = jax.tree.map(lambda k: jnp.sum(~k, 1), known)
-    sums = {
-        name: (jnp.sum(known[name], 0), jnp.sum(x, 0), jnp.sum(jnp.square(x), 0))
-        for name, x in filled.items()
-    }
-    return runwise, absent, sums
 
 
 def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

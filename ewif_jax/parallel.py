@@ -17,7 +17,7 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions import passage as way
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import Passage
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.trial import validated
 from ewif_jax.types import Gaussian, Measurement, Trace
 
@@ -68,7 +68,7 @@ def run_parallel(
     known = method in ("blocked", "associative")
     checks.require(known, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
-    checks.stream(measurements)
+    checked_stream(measurements)
     validated(estimator, params, measurements, prior, t0, times, "validity", None)
     measurements = cast(measurements, float_dtype(measurements.value))
     steps = measurements.value.shape[0]

@@ -1,9 +1,12 @@
 """What one estimate is worth, arrival by arrival: the common ground of losses and metrics.
 
-A score is a function (step, truth (k,), mask (m,)) -> () of one run after one arrival; NaN means
-"cannot say" (nothing known yet, nothing measured) and is left out of averages.
+A score is a function (step, truth (k,), mask (m,)) -> () of one run after one arrival. NaN means
+"cannot say" (nothing known yet, nothing measured) and is left out of averages; infinity is a score
+like others. Where the filter's numbers are no estimates (a log likelihood that is -inf or NaN
+beside something else that is not a number, or a covariance that is none) a score is infinite.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import cache, partial
 from typing import Any
@@ -14,12 +17,11 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.analysis.consistency import nees, nis
+from ewif_jax.analysis import consistency
 from ewif_jax.batch import Observer, Step, run_batch
-from ewif_jax.estimator import Clock
 from ewif_jax.fast.compiling import array
-from ewif_jax.streams import float_dtype
-from ewif_jax.types import Estimator, Gaussian, Measurement, Status
+from ewif_jax.streams import checked_stream, float_dtype
+from ewif_jax.types import Estimator, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]
 
@@ -28,44 +30,46 @@ def squared_error(step: Step, truth: Array, mask: Array) -> Array:
     """Squared distance of the first k components of the mean from the truth (k,)."""
     del mask
     error = step.mean[: truth.shape[0]] - truth
-    known = jnp.all(jnp.isfinite(error))
-    return jnp.where(known, jnp.sum(jnp.square(jnp.where(known, error, 0))), jnp.nan)
+    is_finite = jnp.all(jnp.isfinite(error))
+    square = jnp.sum(jnp.square(jnp.where(is_finite, error, 0)))
+    # An estimate or truth that is NaN says nothing; one that has run away is as wrong as can be.
+    rest = jnp.where(jnp.any(jnp.isnan(error)), _silent_or_broken(step), jnp.inf)
+    return jnp.where(is_finite, square, jnp.where(jnp.any(jnp.isnan(truth)), jnp.nan, rest))
 
 
 def normalised_error(step: Step, truth: Array, mask: Array) -> Array:
     """NEES divided by its expectation k: 1 on average if the covariance is honest."""
     del mask
-    return nees(step.mean, step.cov, truth) / truth.shape[0]
+    ratio = consistency.nees(step.mean, step.cov, truth) / truth.shape[0]
+    absent = jnp.any(jnp.isnan(truth))
+    return jnp.where(jnp.isnan(ratio) & ~absent, _silent_or_broken(step), ratio)
 
 
 def normalised_innovation(step: Step, truth: Array, mask: Array) -> Array:
     """NIS per measured component: 1 on average if consistent; NaN if none was used."""
     del truth
     count = jnp.maximum(jnp.sum(mask).astype(step.mean.dtype), 1)
-    return jnp.where(_used(step), nis(step.info) / count, jnp.nan)
+    return _where_used(step, consistency.nis(step.info) / count)
 
 
 def negative_log_likelihood(step: Step, truth: Array, mask: Array) -> Array:
     """Minus the log likelihood of the measurement; NaN if it was not used."""
     del truth, mask
-    return jnp.where(_used(step), -step.info.log_likelihood, jnp.nan)
+    return _where_used(step, -step.info.log_likelihood)
 
 
 def squared_innovation(step: Step, truth: Array, mask: Array) -> Array:
     """Squared one-step prediction error; NaN if the measurement was not used."""
     del truth, mask
-    return _of_innovation(step, lambda square: square)
+    return _where_used(step, _square(step))
 
 
 def robust_innovation(step: Step, truth: Array, mask: Array) -> Array:
     """Length of the one-step prediction error, which outliers pull less; NaN as above."""
     del truth, mask
-
-    def length(square: Array) -> Array:
-        safe = jnp.where(square > 0, square, 1)
-        return jnp.where(square > 0, jnp.sqrt(safe), 0)
-
-    return _of_innovation(step, length)
+    square = _square(step)
+    length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), square)
+    return _where_used(step, length)
 
 
 def scored(
@@ -75,22 +79,25 @@ def scored(
     truth: Any = None,
     *,
     scores: Mapping[str, Score],
-    prior: Gaussian | None,
-    t0: Any,
-    times: Any = None,
-    clock: Clock = "validity",
-    key: Any = None,
-    params_per_run: Any = False,
-    devices: int | None = None,
+    **setting: Any,
 ) -> dict[str, Array]:
     """Scores (R, T) of every run and arrival, in the fast layout of `run_batch`.
 
-    Arguments as in `run_batch`; a single stream is a batch of one. `truth` is (T, k) or
-    (R, T, k), or None for scores that need none; `key` may be one typed key for each run.
+    Args:
+        estimator, params: as in `run_batch`.
+        measurements: a batch (R, T, ...); a single stream (T, ...) is a batch of one.
+        truth: (T, k) or (R, T, k), NaN where there is none; None for scores that need none.
+        scores: functions (step, truth, mask) -> () by name.
+        **setting: prior, t0, times, clock, key, params_per_run, devices, ... as in `run_batch`.
+
+    Raises:
+        ValueError: what `run_batch` refuses; a truth of another length, or infinite; something in
+            `scores` that is no score.
     """
-    if np.ndim(measurements.value) == 2:
-        measurements = measurements._replace(value=array(measurements.value)[None])
-    checks.stream(measurements, batched=True)
+    for name, score in scores.items():
+        checks.require(callable(score), f"metrics[{name!r}]", _SCORE, repr(score))
+    measurements = as_batch(measurements)
+    checked_stream(measurements, batched=True)
     runs, steps = np.shape(measurements.value)[:2]
     truth = array(np.zeros((steps, 0)) if truth is None else truth)
     lead = ("R", "T") if truth.ndim == 3 else ("T",)
@@ -102,26 +109,30 @@ def scored(
         estimator,
         params,
         measurements,
-        prior=prior,
-        t0=t0,
-        times=times,
-        clock=clock,
-        key=key,
-        params_per_run=params_per_run,
+        **setting,
         observe=_all_of(tuple(scores.items())),
         context=(truth.astype(float_dtype(measurements.value)), mask),
         context_per_run=(truth.ndim == 3, mask.ndim == 3),
-        devices=devices,
     )
+
+
+def as_batch(measurements: Measurement) -> Measurement:
+    """A single stream (T, ...) as a batch of one; a batch as it is."""
+    if np.ndim(measurements.value) != 2:
+        return measurements
+    return measurements._replace(value=array(measurements.value)[None])
 
 
 @partial(jax.jit, static_argnames="axis", inline=True)
 def average(values: Array, axis: int | None = None) -> Array:
     """Mean over `axis` of the values that are not NaN; NaN if there are none."""
-    known = jnp.isfinite(values)
-    count = jnp.sum(known, axis)
-    total = jnp.sum(jnp.where(known, values, 0), axis)
+    is_score = ~jnp.isnan(values)
+    count = jnp.sum(is_score, axis)
+    total = jnp.sum(jnp.where(is_score, values, 0), axis)
     return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
+
+
+_SCORE = "a score: a function (step, truth (k,), mask (m,)) -> () of one run after one arrival"
 
 
 @cache
@@ -130,17 +141,44 @@ def _all_of(scores: tuple[tuple[str, Score], ...]) -> Observer:
     compiled again."""
 
     def observe(step: Step, seen: tuple[Array, Array]) -> dict[str, Array]:
-        return {name: score(step, *seen) for name, score in scores}
+        return {name: _score_of(name, score, step, *seen) for name, score in scores}
 
     return observe
 
 
+def _score_of(name: str, score: Score, step: Step, truth: Array, mask: Array) -> Array:
+    """The score, or an error that says what a score is: functions of arrays look like scores."""
+    try:
+        inspect.signature(score).bind(step, truth, mask)
+        found = score(step, truth, mask)
+        shape = jnp.shape(found)
+    except (TypeError, AttributeError) as error:
+        got = f"{getattr(score, '__name__', score)}, which fails with: {error}"
+        raise ValueError(f"metrics[{name!r}]: expected {_SCORE}, got {got}") from error
+    checks.require(shape == (), f"metrics[{name!r}]", _SCORE, f"shape {shape}")
+    return jnp.asarray(found)
+
+
 def _used(step: Step) -> Array:
-    used = (step.info.status == Status.USED) | (step.info.status == Status.LATE_USED)
-    return used & jnp.all(jnp.isfinite(step.info.innovation))
+    return (step.info.status == Status.USED) | (step.info.status == Status.LATE_USED)
 
 
-def _of_innovation(step: Step, measure: Callable[[Array], Array]) -> Array:
-    used = _used(step)
-    square = jnp.sum(jnp.square(jnp.where(used, step.info.innovation, 0)))
-    return jnp.where(used, measure(square), jnp.nan)
+def _where_used(step: Step, score: Array) -> Array:
+    """`score` of a measurement that was used and predicted, otherwise NaN; infinite where
+    variances or densities are none."""
+    said = jnp.all(jnp.isfinite(step.info.innovation)) & ~jnp.isnan(step.info.log_likelihood)
+    kept = jnp.where(jnp.isnan(score), jnp.inf, score)
+    return jnp.where(_used(step), jnp.where(said, kept, _silent_or_broken(step)), jnp.nan)
+
+
+def _silent_or_broken(step: Step) -> Array:
+    """Where there is no number: NaN if nothing is known (the likelihood says so by 0), infinity if
+    what came is outside of its domain (it is -inf or NaN)."""
+    return jnp.where(jnp.isfinite(step.info.log_likelihood), jnp.nan, jnp.inf)
+
+
+def _square(step: Step) -> Array:
+    """The squared length of the innovation; 0 where it is not a number."""
+    innovation = step.info.innovation
+    is_defined = _used(step) & jnp.all(jnp.isfinite(innovation))
+    return jnp.sum(jnp.square(jnp.where(is_defined, innovation, 0)))

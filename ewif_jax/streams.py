@@ -8,7 +8,11 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
+from ewif_jax.fast.memo import once
 from ewif_jax.types import Measurement
+
+checked_stream = once(checks.stream)
+"""`checks.stream`, which passes over all numbers, once for the same arrays of JAX."""
 
 
 def stream(time: Any, value: Any, sensor: Any = 0, mask: Any = None) -> Measurement:

@@ -5,10 +5,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.fast.compiling import array
+from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -35,6 +38,7 @@ def validated(
     checks.resolvable(measurements.time, dtype)
     if times is not None:
         checks.report_times(times, np.shape(measurements.time)[0])
+    check_times(estimator.model, measurements, t0, dtype, times)
     sensors = checks.known(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
@@ -49,31 +53,24 @@ def validated(
         return arrive(estimator, given, state, one, None if times is None else times[0]).kept
 
     shapes = np.shape(measurements.value), times is None, clock
-    trial = _fingerprint((estimator, shapes, dtype, key is None), (params, prior, t0, last))
-    if trial is None:
+    setting = str(dtype), key is None, bool(jax.config.jax_enable_x64)  # pyright: ignore
+    leaves, structure = jax.tree.flatten((params, prior, t0, last))
+    # Trying takes longer than filtering a short stream, so equal trials are made once.
+    values = [None if isinstance(x, Tracer) else np.asarray(x) for x in leaves]
+    asked = None
+    if all(value is not None for value in values):
+        asked = question_of(estimator, shapes, setting, values)
+    question = None if asked is None else (validated, structure, asked)
+
+    def tried() -> Any:
+        model, stamps = estimator.model, measurements.time
+        check_covariances_of(model, params, t0, stamps, measurements.sensor)
         return jax.eval_shape(first)
-    if trial not in _tried:
-        if len(_tried) >= 1000:
-            _tried.clear()
-        _tried[trial] = jax.eval_shape(first)
-    return _tried[trial]
+
+    return remembered(question, tried)
 
 
 def _indexable(x: Any) -> Any:
     """`x`, its value known as before; but a NumPy table cannot be indexed while tracing."""
     with jax.ensure_compile_time_eval():
         return array(x) if isinstance(x, np.ndarray) else x
-
-
-_tried: dict[Any, Any] = {}
-"""What has gone through one trial arrival, and the shapes of the state that came out: trying takes
-longer than filtering a short stream."""
-
-
-def _fingerprint(structure: Any, values: Any) -> Any:
-    """Equal for equal trials; None while something in `values` is not known."""
-    leaves, tree = jax.tree.flatten(values)
-    known = [x for x in map(checks.known, leaves) if x is not None]
-    if len(known) < len(leaves):
-        return None
-    return structure, tree, tuple((x.shape, x.dtype.str, x.tobytes()) for x in known)

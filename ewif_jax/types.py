@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from jax import Array
+
+from ewif_jax.recipe import FromRecipe
 
 
 class Measurement(NamedTuple):
@@ -63,29 +65,79 @@ class Info(NamedTuple):
     status: Array
 
 
-class Estimator(NamedTuple):
+class Steps(NamedTuple):
+    """How the time of a discrete-time model is counted: in whole steps of `dt` seconds, at most
+    `max_steps` of them at once."""
+
+    dt: float
+    max_steps: int
+
+
+class Init(Protocol):
+    """The first state: of the prior at time t0; the PRNG key is for a filter that draws noise.
+
+    Everything is in the dtype of `t0`. `prior` is None where nothing is known about the state.
+    """
+
+    def __call__(
+        self, params: Any, prior: Gaussian | None, t0: Array, /, key: Any = None
+    ) -> Any: ...
+
+
+class Predict(Protocol):
+    """The state moved to `time` (), with what the filter knows. Earlier than the state: NaN in what
+    `estimate` reports of it, unless the method can go back."""
+
+    def __call__(self, params: Any, state: Any, time: Array, /) -> Any: ...
+
+
+class Update(Protocol):
+    """The state after a measurement at its time or an earlier one, and diagnostics."""
+
+    def __call__(
+        self, params: Any, state: Any, measurement: Measurement, /
+    ) -> tuple[Any, Info]: ...
+
+
+class Estimate(Protocol):
+    """The mean (n,) and covariance (n, n) that a state stands for."""
+
+    def __call__(self, params: Any, state: Any, /) -> Gaussian: ...
+
+
+class _Estimator(NamedTuple):
+    init: Init
+    predict: Predict
+    update: Update
+    estimate: Estimate
+    series: Callable[..., Any] | None = None
+    model: Any = None
+
+
+class Estimator(FromRecipe, _Estimator):
     """Four pure functions; every filter of the package, in sequence or not, is one.
 
     init(params, prior, t0, key=None) -> state
     predict(params, state, time) -> state at `time`
     update(params, state, measurement) -> (state, Info); accepts measurement.time <= state.time
     estimate(params, state) -> Gaussian
+    series: how a whole series is filtered faster with the same result, if there is a way
 
-    A state is a pytree with a field `time` and holds only what the next step needs.
+    model: what the filter is a filter of, if one Model says it: a model in discrete time has no
+        state between two of its steps
+
+    A state is a pytree with a field `time` and holds only what the next step needs. A wrapper that
+    changes one of the four builds a new `Estimator`, and so leaves `series` behind.
     """
-
-    init: Callable[..., Any]
-    predict: Callable[..., Any]
-    update: Callable[..., tuple[Any, Info]]
-    estimate: Callable[..., Gaussian]
 
 
 class Trace(NamedTuple):
-    """What `run` returns, stacked over arrivals: time (T,), mean (T, n), cov (T, n, n), info, and
-    the state after the last arrival (ready for `step`)."""
+    """What `run` returns, stacked over arrivals: time (T,), mean (T, n), cov (T, n, n), info, the
+    state after the last arrival (ready for `step`), and what was recorded besides, if anything."""
 
     time: Array
     mean: Array
     cov: Array
     info: Info
     final_state: Any
+    recorded: Any = None

@@ -13,6 +13,7 @@ ROOT = Path(ewif_jax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 
 RANKS = (
+    {"recipe"},
     {"types"},
     {"checks"},
     {"fast"},
@@ -25,7 +26,8 @@ RANKS = (
     {"recursions", "batch"},
     {"estimators"},
     {"oosm", "smoothers", "analysis", "parallel"},
-    {"scores", "continuous"},
+    {"scores", "continuous", "charges"},
+    {"losses", "transforms"},
     {"tuning", "monte_carlo"},
     {"scenarios"},
     {"study"},
@@ -144,3 +146,17 @@ def test_importing_changes_no_setting_and_brings_nothing_but_the_dependencies():
     assert done.returncode == 0, done.stderr
     third_party = set(done.stdout.split()) - set(sys.stdlib_module_names)
     assert third_party <= {"ewif_jax", "jax", "jaxlib", "numpy", "optax", "ml_dtypes", "opt_einsum"}
+
+
+BUILT = ("Estimator", "Model", "Scenario", "Sensor", "Transform")
+
+
+@pytest.mark.parametrize("file", FILES, ids=module)
+def test_what_a_public_builder_makes_knows_its_recipe(file):
+    if room(module(file)) in ("recursions", "study") or module(file) == "oosm.history":
+        return  # parts of builders
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            builds = isinstance(node.returns, ast.Name) and node.returns.id in BUILT
+            names = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
+            assert not builds or "from_recipe" in names, f"{module(file)}.{node.name}"

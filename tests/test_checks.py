@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ewif_jax as ej
-from ewif_jax import Gaussian, Measurement, batch, checks
+from ewif_jax import Gaussian, Measurement, batch
 from ewif_jax.analysis.anderson import System
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem
 from ewif_jax.continuous.kalman_bucy import Signal
@@ -640,52 +640,6 @@ def test_numpy_compiles_nothing_and_new_parameters_compile_nothing_again(caplog)
         assert compiled()
         filtered(2.0, stream)
         assert not compiled()
-
-
-def test_only_what_cannot_change_is_looked_at_once(monkeypatch):
-    looks = []
-    vdot = np.vdot
-    monkeypatch.setattr(np, "vdot", lambda a, b: looks.append(0) or vdot(a, b))
-    x = jnp.arange(3.0)
-    checks.finite("x", x)
-    checks.finite("x", x)
-    assert len(looks) == 1
-    changes = np.arange(3.0)
-    checks.finite("x", changes)
-    changes[1] = np.nan
-    with pytest.raises(ValueError, match="x: expected finite numbers, got nan at index 1"):
-        checks.finite("x", changes)
-    for _ in range(2):  # what was refused, or is gone, is not among them
-        with pytest.raises(ValueError, match="got inf at index 0"):
-            checks.finite("x", jnp.array([jnp.inf, 1.0]))
-
-
-def test_an_answer_is_kept_for_the_same_arrays_alone():
-    asked = []
-
-    @checks.once
-    def check(*args, **kwargs):
-        asked.append(args[1:])  # not the first: it shall be gone after its check
-        checks.require(kwargs.get("good", True), "good", "True", False)
-        return len(asked)
-
-    x, y = jnp.zeros(2), jnp.zeros(2)
-    assert [check(x, 1), check(x, 1), check((x,), 1), check(x, 1)] == [1, 1, 2, 1]
-    assert [check(y, 1), check(x, 1.0), check(x, True), check(1, x)] == [3, 4, 5, 6]
-    assert [check(x, good=True), check(x, good=True)] == [7, 7]
-    changes = np.zeros(2)
-    assert [check(x, changes), check(x, changes)] == [8, 9]
-    assert [check(2), check(2)] == [10, 11]  # no array: as quick as looking it up
-    for count in (12, 13):
-        with pytest.raises(ValueError, match="good: expected True, got False"):
-            check(x, good=False)
-        assert len(asked) == count
-    jax.jit(lambda t: check(t) * t)(1.0)
-    jax.jit(lambda t: check(t) * (t + 1))(1.0)
-    assert len(asked) == 15
-    for k in range(20):  # a new array may come to where an old one was
-        check(jnp.full(2, k))
-    assert len(asked) == 35
 
 
 def test_a_batch_looks_again_at_what_is_not_the_same(monkeypatch):

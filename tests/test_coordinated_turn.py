@@ -12,7 +12,7 @@ from laws.cases import close
 from scipy.integrate import solve_ivp
 
 import ewif_jax as ej
-from ewif_jax.models import bearing_sensor, constant_velocity, coordinated_turn, flow
+from ewif_jax.models import bearing_sensor, constant_velocity, coordinated_turn, predict_state
 
 SEEN = bearing_sensor(0.1)
 TURN = coordinated_turn(sensors=SEEN, q=2.0, q_turn=lambda p: p)
@@ -35,7 +35,7 @@ def jacobian(x, t0, t1):
 
 @jax.jit
 def flowing(q_turn, x, t0, t1):
-    return flow(TURN, q_turn, x, t0, t1)
+    return predict_state(TURN, q_turn, x, t0, t1)
 
 
 def integrated(x, t0, t1):
@@ -93,7 +93,7 @@ def test_turning_at_rate_zero_is_constant_velocity():
     x, t0, t1 = start(0.0), jnp.asarray(0.4), jnp.asarray(2.1)
     straight = constant_velocity(sensors=SEEN, q=2.0, dims=2)
     moved, F, Q = flowing(0.3, x, t0, t1)
-    there, F_there, Q_there = jax.jit(partial(flow, straight, None))(x[:4], t0, t1)
+    there, F_there, Q_there = jax.jit(partial(predict_state, straight, None))(x[:4], t0, t1)
     close(moved[:4], there)
     close(F[:4, :4], F_there)
     close(Q[:4, :4], Q_there)

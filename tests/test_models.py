@@ -15,10 +15,10 @@ from ewif_jax.models import (
     bearing_sensor,
     constant_acceleration,
     constant_velocity,
-    flow,
     position_sensor,
+    predict_measurement,
+    predict_state,
     random_walk,
-    sight,
     wrap_angle,
 )
 
@@ -99,11 +99,11 @@ def test_motion_reverses_input_included(name, t0, t1):
 def test_flow_and_sight_agree_with_the_functions_of_the_model():
     model = build("ca", dims=2, b=lambda p, t0, t1: (t1 - t0) * jnp.ones(6))
     x, t0, t1 = jnp.arange(6.0), jnp.asarray(0.2), jnp.asarray(0.9)
-    moved, F, Q = flow(model, None, x, t0, t1)
+    moved, F, Q = predict_state(model, None, x, t0, t1)
     close(moved, model.transition(None, x, t0, t1))
     close(F, jax.jacfwd(lambda x: model.transition(None, x, t0, t1))(x))
     close(Q, model.process_cov(None, t0, t1))
-    value, H, R = sight(model, None, x, jnp.int32(0), t1)
+    value, H, R = predict_measurement(model, None, x, jnp.int32(0), t1)
     close(value, x[:2])
     close(H, np.eye(2, 6))
     close(R, 0.5 * np.eye(2))
@@ -117,9 +117,9 @@ def test_a_nonlinear_flow_is_differentiated():
         lambda p, sensor, t: jnp.eye(1),
     )
     x = jnp.asarray([0.3, 1.1])
-    _, F, _ = flow(model, None, x, jnp.asarray(0.0), jnp.asarray(2.0))
+    _, F, _ = predict_state(model, None, x, jnp.asarray(0.0), jnp.asarray(2.0))
     close(F, 2.0 * np.diag(np.cos(x)))
-    _, H, _ = sight(model, None, x, jnp.int32(0), jnp.asarray(0.0))
+    _, H, _ = predict_measurement(model, None, x, jnp.int32(0), jnp.asarray(0.0))
     close(H, [[0.6, 0.0]])
 
 
@@ -151,7 +151,7 @@ def test_tables_and_sensors_are_looked_up_by_index():
     assert model.sensors == 2
     x = jnp.asarray([1.0, -1.0])
     for k in range(2):
-        value, seen, cov = sight(model, None, x, jnp.int32(k), jnp.asarray(0.0))
+        value, seen, cov = predict_measurement(model, None, x, jnp.int32(k), jnp.asarray(0.0))
         close(value, H[k] @ x)
         close(seen, H[k])
         close(cov, R[k])
@@ -196,5 +196,5 @@ def test_a_target_at_the_bearing_sensor_has_a_finite_gradient():
 def test_float32_models_stay_float32():
     model = build("ca", dims=2)
     t0, t1 = jnp.float32(0.0), jnp.float32(0.5)
-    moved, F, Q = flow(model, None, jnp.zeros(6, jnp.float32), t0, t1)
+    moved, F, Q = predict_state(model, None, jnp.zeros(6, jnp.float32), t0, t1)
     assert moved.dtype == F.dtype == Q.dtype == np.float32

@@ -10,7 +10,7 @@ from oracles import fisher
 import ewif_jax as ej
 from ewif_jax import Measurement
 from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_equivalent, pcrlb_late
-from ewif_jax.models import bearing_sensor, constant_velocity, coordinated_turn, flow
+from ewif_jax.models import bearing_sensor, constant_velocity, coordinated_turn, predict_state
 
 PLACES = np.array([[-200.0, 0.0], [200.0, 0.0]])
 R = 0.05**2
@@ -233,7 +233,9 @@ def test_no_filter_beats_it():
     runs, rng = 400, np.random.default_rng(5)
     time = np.arange(1.0, 13.0)
     states = [truth(4)(0.0) + rng.normal(size=(runs, 4)) @ np.sqrt(COV[4] / 25)]
-    step = jax.vmap(lambda x: flow(STRAIGHT, None, x, jnp.asarray(0.0), jnp.asarray(1.0))[0])
+    step = jax.vmap(
+        lambda x: predict_state(STRAIGHT, None, x, jnp.asarray(0.0), jnp.asarray(1.0))[0]
+    )
     factor = np.linalg.cholesky(Q(4)(0.0, 1.0))
     for _ in time:
         states.append(np.asarray(step(states[-1])) + rng.normal(size=(runs, 4)) @ factor.T)

@@ -131,7 +131,7 @@ def test_tune_finds_an_optimum_and_keeps_its_constraints():
     assert np.all(np.linalg.eigvalsh(tuned.history["params"]["R"]) > 0)
 
 
-def test_a_loss_is_compiled_once():
+def test_a_loss_is_checked_once_and_compiled_once():
     traces = []
 
     def loss(p):
@@ -139,7 +139,7 @@ def test_a_loss_is_compiled_once():
         return (p["x"] - 1.0) ** 2
 
     ej.tune(loss, {"x": 3.0}, steps=5)
-    assert len(traces) == 1
+    assert len(traces) == 2
 
 
 def test_an_infinite_gradient_leaves_the_parameters():

@@ -4,9 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
-from jax.scipy.special import gammainc
 
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
@@ -62,12 +60,14 @@ def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float
 
     The usual two-sided acceptance band of average NEES or NIS.
     """
+    from scipy.special import gammaincinv  # here: the import takes longer than the call
+
     checks.whole("dof", dof, 1)
     checks.whole("samples", samples, 1)
     checks.require(0 < level < 1, "level", "a probability between 0 and 1", level)
     shape = dof * samples / 2
     tail = (1 - level) / 2
-    low, high = (2 * _gamma_quantile(shape, p) / samples for p in (tail, 1 - tail))
+    low, high = (2 * float(gammaincinv(shape, p)) / samples for p in (tail, 1 - tail))
     return low, high
 
 
@@ -90,11 +90,3 @@ def _quadratic(error: Array, cov: Array) -> Array:
         return jnp.where(known, white @ white, jnp.nan)
 
     return jax.vmap(one)(flat, matrices).reshape(lead)
-
-
-def _gamma_quantile(shape: float, p: float) -> float:
-    low, high = 0.0, shape + 20 * np.sqrt(shape) + 20
-    for _ in range(200):
-        middle = (low + high) / 2
-        low, high = (middle, high) if float(gammainc(shape, middle)) < p else (low, middle)
-    return (low + high) / 2

@@ -11,7 +11,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.models import Model
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement
 
 
@@ -54,7 +54,7 @@ def crlb(
     Raises:
         ValueError: unusable measurements, state or time.
     """
-    checks.stream(measurements)
+    checked_stream(measurements)
     checks.finite("time", time)
     dtype = float_dtype(state)
     stream, time = cast(measurements, dtype), jnp.asarray(time, dtype)

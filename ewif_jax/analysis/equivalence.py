@@ -66,6 +66,10 @@ def equivalent_tau(
         m: number of measured components.
         steps: arrivals until a gain counts as steady (many tau / dt).
         bounds: search interval for tau in seconds; default (dt / 20, steps * dt / 10).
+
+    Raises:
+        ValueError: no tau in `bounds` has the same expected error (where the Kalman filter does
+            better than any tau); the message names the tau that comes nearest.
     """
     checks.positive("dt", dt)
     low, high = bounds or (dt / 20, steps * dt / 10)
@@ -75,7 +79,7 @@ def equivalent_tau(
 
     def mismatch(tau: Array) -> Array:
         gain = settled_gain(exponential, (tau, params), m, dt, steps)
-        return jnp.sum(jnp.square(gain / target - 1))
+        return _relative_difference(gain, target)
 
     by_gain = _minimise(mismatch, low, high)
     if case is None:
@@ -110,6 +114,9 @@ def equivalent_process_noise(
         case, m, steps: as in `equivalent_tau`.
         bounds: search interval for q.
 
+    Raises:
+        ValueError: no q in `bounds` has the same expected error; the message names the nearest.
+
     See also: `weighting_as_process_noise` and `weighting_as_input_noise`, Anderson's (5-16) and
     (4-7): the noise, another one at every step, that has exactly the gains of a weighted filter.
     """
@@ -123,7 +130,7 @@ def equivalent_process_noise(
 
     def mismatch(q: Array) -> Array:
         gain = settled_gain(noisy, params_of(q), m, dt, steps)
-        return jnp.sum(jnp.square(gain / target - 1))
+        return _relative_difference(gain, target)
 
     by_gain = _minimise(mismatch, low, high)
     if case is None:
@@ -132,6 +139,19 @@ def equivalent_process_noise(
     return _nearest_root(
         lambda q: _mean_mse(noisy, params_of(q), case) - wanted, low, high, by_gain
     )
+
+
+def _relative_difference(gain: Array, target: Array) -> Array:
+    """The sum of the squares of the relative differences of two gain matrices.
+
+    A gain that should be 0 (of one axis of the plane for the other) has no relative difference: it
+    counts beside the largest gain of its state.
+    """
+    largest = jnp.max(jnp.abs(target), 1, keepdims=True)
+    rounding = 1e3 * float(jnp.finfo(target.dtype).eps)
+    is_coupled = jnp.abs(target) > rounding * largest
+    scale = jnp.where(is_coupled, target, jnp.where(largest > 0, largest, 1))
+    return jnp.sum(jnp.square((gain - target) / scale))
 
 
 def _mean_mse(estimator: Estimator, params: Any, case: Case) -> Array:
@@ -153,19 +173,29 @@ def _minimise(fn: Callable[[Array], Array], low: float, high: float) -> float:
     a, b = np.log(low), np.log(high)
     for _ in range(14):
         grid = np.linspace(a, b, 33)
-        best = int(np.nanargmin(np.asarray(evaluate(jnp.exp(grid)))))
+        values = np.asarray(evaluate(jnp.exp(grid)))
+        checks.require(
+            np.isfinite(values).any(), "bounds", "an interval in which the filter settles",
+            f"no finite gain from {low:g} to {high:g} (more steps, or another dt or m?)",
+        )  # fmt: skip
+        best = int(np.nanargmin(values))
         a, b = grid[max(best - 1, 0)], grid[min(best + 1, 32)]
     return float(np.exp((a + b) / 2))
 
 
 def _nearest_root(fn: Callable[[Array], Array], low: float, high: float, near: float) -> float:
-    """The root in [low, high] nearest to `near` on a log scale; NaN if there is none."""
+    """The root in [low, high] nearest to `near` on a log scale."""
     evaluate = jax.jit(jax.vmap(fn))
     grid = np.linspace(np.log(low), np.log(high), 129)
     value = np.asarray(evaluate(jnp.exp(grid)))
     crossing = np.flatnonzero(np.sign(value[:-1]) * np.sign(value[1:]) <= 0)
     if crossing.size == 0:
-        return float("nan")
+        nearest = _minimise(lambda x: jnp.abs(fn(x)), low, high)
+        least = float(fn(jnp.asarray(nearest)))
+        checks.require(
+            False, "case", f"a value from {low:g} to {high:g} with the same expected error",
+            f"none; nearest is {nearest:.6g}, whose mean square error differs by {least:.3g}",
+        )  # fmt: skip
     k = crossing[np.argmin(np.abs(grid[crossing] + grid[crossing + 1] - 2 * np.log(near)))]
     a, b, sign = grid[k], grid[k + 1], np.sign(value[k])
     for _ in range(9):

@@ -12,8 +12,8 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models import Model, flow, sight
-from ewif_jax.streams import cast, float_dtype
+from ewif_jax.models import Model, predict_measurement, predict_state
+from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement
 
 Bound = tuple[Array, Array, Array]
@@ -209,9 +209,9 @@ def _equivalent(
         cov, before, last = carry
         measurement, state, time = now
         moved = _moved(model, params, cov, before, last, time)
-        there, back, _ = flow(model, params, state, time, measurement.time)
+        there, back, _ = predict_state(model, params, state, time, measurement.time)
         noise = jnp.asarray(model.process_cov(params, measurement.time, time), cov.dtype)
-        _, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+        _, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
         seen = matmul(H, back)
         spread = R + matmul(matmul(seen, noise), seen.T)
         after = _informed(moved, _precision(seen, spread, measurement.mask))
@@ -225,7 +225,9 @@ def _moved(model: Model, params: Any, cov: Array, states: Array, t0: Array, t1: 
 
     With F = E[F] + dF, the inverse of (64) is Q + E[F] (J + E[dF' Q^-1 dF])^-1 E[F]'.
     """
-    _, F, Q = jax.vmap(lambda x: flow(model, params, x, t0, t1), out_axes=(0, 0, None))(states)
+    _, F, Q = jax.vmap(lambda x: predict_state(model, params, x, t0, t1), out_axes=(0, 0, None))(
+        states
+    )
     mean = F.mean(0)
     root = cholesky.factor(Q)
     apart = jax.vmap(lambda F: cholesky.forward(root, F - mean))(F)
@@ -237,7 +239,7 @@ def _information(model: Model, params: Any, states: Array, measurement: Measurem
     """E[H' R^-1 H] over the true states (R, n)."""
 
     def one(x: Array) -> Array:
-        _, H, R = sight(model, params, x, measurement.sensor, measurement.time)
+        _, H, R = predict_measurement(model, params, x, measurement.sensor, measurement.time)
         return _precision(H, R, measurement.mask)
 
     return jax.vmap(one)(states).mean(0)
@@ -265,7 +267,7 @@ def _checked(
 ) -> tuple[Measurement, Array, Bound]:
     """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
     truth, after what can be known is checked."""
-    checks.stream(measurements)
+    checked_stream(measurements)
     checks.sensors(measurements, model.sensors)
     steps = jnp.shape(measurements.time)[0]
     checks.shape("truth", truth, ("R", steps, "n"))

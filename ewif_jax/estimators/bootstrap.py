@@ -4,12 +4,14 @@ from typing import Any
 
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def bootstrap(
     model: Model,
     particles: int,
@@ -77,4 +79,4 @@ def bootstrap(
         log_weights, info = weighing.weigh(state, seen, measurement, reachable=False)
         return state._replace(log_weights=log_weights), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

@@ -8,6 +8,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.ensembles import EnsembleState
@@ -16,6 +17,7 @@ from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 FORMS = ("stochastic", "square_root")
 
 
+@from_recipe
 def ensemble(
     model: Model, members: int, form: Literal["stochastic", "square_root"] = "stochastic"
 ) -> Estimator:
@@ -95,4 +97,4 @@ def ensemble(
         del params
         return ensembles.moments(state.members)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)

@@ -7,13 +7,16 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear, need_reversible
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
+@from_recipe
 def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None = None) -> Estimator:
     r"""The least-squares estimate in which a measurement of age s counts exp(-s / tau).
 
@@ -52,6 +55,7 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear.
     """
     need_linear(model, "ewif")
+    need_reversible(model, "ewif")
     one = (tau is None) != (weight is None)
     checks.require(one, "tau", "one of `tau` and `weight`", (tau, weight))
     if tau is not None and not callable(tau):
@@ -88,4 +92,4 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         del params
         return form.settled(state)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)

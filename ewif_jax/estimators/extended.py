@@ -2,10 +2,12 @@
 
 from ewif_jax import checks
 from ewif_jax.models.model import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def extended(model: Model) -> Estimator:
     r"""The Kalman filter of the model linearised at the current mean.
 

@@ -7,11 +7,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.steps import count_steps
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def fading(
     model: Model, fading: Any = None, *, inflation: Callable[..., Array] | None = None
 ) -> Estimator:
@@ -26,8 +30,9 @@ def fading(
 
     Args:
         model: a linear `Model`.
-        fading: Anderson's alpha >= 1 for every move over a nonempty interval, whatever its length;
-            a number or a function of `params`.
+        fading: Anderson's alpha >= 1, a number or a function of `params`: for every step of a
+            discrete model, alpha^(2k) over k of them; else for every move over a nonempty
+            interval, whatever its length.
         inflation: instead, the factor alpha^2 of an interval, a function (params, t0, t1) -> ();
             exp((t1 - t0) / tau) makes this filter the EWIF when Q = 0.
 
@@ -53,6 +58,9 @@ def fading(
 
     def per_step(params: Any, t0: Array, t1: Array) -> Array:
         alpha = checks.at_least("fading", resolve(fading, params), 1.0)
-        return jnp.where(t1 > t0, jnp.square(alpha), 1)
+        if model.steps is None:
+            return jnp.where(t1 > t0, jnp.square(alpha), 1)
+        k, _ = count_steps(model.steps, t0, t1)
+        return jnp.where(k > 0, alpha, 1) ** (2 * k)
 
     return covariance_form(model, "fading", per_step)

@@ -7,13 +7,16 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import symmetric
-from ewif_jax.models.model import Model, affine_flow, need_linear
+from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible
+from ewif_jax.models.model import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def information(model: Model) -> Estimator:
     r"""The Kalman filter on the information matrix, which may start from nothing.
 
@@ -32,6 +35,7 @@ def information(model: Model) -> Estimator:
         ValueError: the model is not linear; a prior with a singular covariance.
     """
     need_linear(model, "information")
+    need_reversible(model, "information")
 
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> InformationState:
         del key
@@ -75,4 +79,4 @@ def information(model: Model) -> Estimator:
         del params
         return form.settled(state)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)

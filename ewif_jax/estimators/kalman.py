@@ -1,10 +1,13 @@
 """The Kalman filter in covariance form."""
 
-from ewif_jax.models.model import Model, need_linear
+from ewif_jax.models.linearise import need_linear
+from ewif_jax.models.model import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def kalman(model: Model) -> Estimator:
     r"""The Kalman filter of a linear model, Joseph-stabilised.
 

@@ -8,7 +8,9 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.linearise import need_linear, need_reversible
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
@@ -23,6 +25,7 @@ class WindowState(NamedTuple):
     buffer: Measurement
 
 
+@from_recipe
 def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     r"""The least-squares estimate from the measurements of the last `window` seconds.
 
@@ -50,6 +53,7 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         ValueError: window <= 0; capacity < 1; a model that is not linear.
     """
     linear = need_linear(model, "limited_memory")
+    need_reversible(model, "limited_memory")
     checks.whole("capacity", capacity, 1)
     if not callable(window):
         checks.positive("window", window)
@@ -73,7 +77,10 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         """Everything inside the window, at `time`, refined once against rounding."""
         half = resolve(window, params)
         inside = jnp.abs(time - state.start.time) <= half
-        base = form.transport(model, params, state.start, time, jnp.where(inside, 1.0, 0.0))
+        weight, there = jnp.where(inside, 1.0, 0.0), time
+        if model.steps is not None:  # what does not count may be too many steps away
+            there = jnp.where(inside, time, state.start.time)
+        base = form.transport(model, params, state.start, there, weight)._replace(time=time)
         stamps = state.buffer.time
         near = jnp.abs(time - stamps) <= half
         safe = state.buffer._replace(
@@ -118,4 +125,4 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     def estimate(params: Any, state: WindowState) -> Gaussian:
         return form.estimate(fit(params, state, state.time))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)

@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
-from ewif_jax.kernels.trees import choose
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.model import Model, flow, need_linear, sight
-from ewif_jax.recursions.contract import verdict
+from ewif_jax.models.linearise import need_linear, predict_state
+from ewif_jax.models.model import Model
+from ewif_jax.recipe import from_recipe
+from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.innovations import compared, unjudged
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -22,6 +23,7 @@ class RootState(NamedTuple):
     root: Array
 
 
+@from_recipe
 def square_root(model: Model) -> Estimator:
     r"""The Kalman filter that carries a triangular root of P and never forms P.
 
@@ -41,31 +43,18 @@ def square_root(model: Model) -> Estimator:
     """
     need_linear(model, "square_root")
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> RootState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> RootState:
         del params, key
-        prior = checks.needs_prior(prior, "square_root")
-        checks.prior(prior)
-        mean = jnp.asarray(prior.mean)
-        root = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
-        return RootState(jnp.asarray(t0, mean.dtype), mean, root)
+        return RootState(t0, prior.mean, cholesky.factor(prior.cov).lower)
 
-    def predict(params: Any, state: RootState, time: Array) -> RootState:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+    def move(params: Any, state: RootState, time: Array) -> RootState:
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
-        known = time >= state.time
-        return RootState(time, jnp.where(known, mean, jnp.nan), jnp.where(known, root, jnp.nan))
+        return RootState(time, mean, root)
 
-    def update(params: Any, state: RootState, measurement: Measurement) -> tuple[RootState, Info]:
-        mask = measurement.mask
-        late = measurement.time < state.time
-        present = jnp.any(mask)
-        predicted, H, R = sight(model, params, state.mean, measurement.sensor, measurement.time)
+    def measure(params: Any, state: RootState, measurement: Measurement) -> tuple[RootState, Info]:
+        difference, H, R, mask = compared(model, params, state.mean, measurement)
         m, n = H.shape
-        checks.shape("measurement.value", measurement.value, (m,))
-        difference = model.residual(measurement.value, predicted, measurement.sensor)
-        difference = jnp.where(mask, difference, 0)
         seen = jnp.where(mask[:, None], H @ state.root, 0)
         noise = cholesky.factor(gaussian.mask_cov(R, mask)).lower
         blank = jnp.zeros((n, m), R.dtype)
@@ -74,22 +63,17 @@ def square_root(model: Model) -> Estimator:
         diagonal = jnp.diag(lower)
         positive = diagonal > 0
         reciprocal = jnp.where(positive, 1 / jnp.where(positive, diagonal, 1), 0)
-        f = cholesky.Factor(lower, reciprocal, jnp.all(positive))
-        white = cholesky.forward(f, difference)
-        used = present & ~late
-        updated = RootState(state.time, state.mean + crossed @ white, root)
-        innovation = gaussian.Innovation(difference, lower @ lower.T, f, seen)
-        info = Info(
-            difference,
-            innovation.cov,
-            jnp.where(used, gaussian.log_density(innovation, mask), 0),
-            state.time - measurement.time,
-            verdict(late, present),
+        factor = cholesky.Factor(lower, reciprocal, jnp.all(positive))
+        innovation = gaussian.Innovation(
+            jnp.where(mask, difference, 0), lower @ lower.T, factor, seen
         )
-        return choose(used, updated, state), info
+        white = cholesky.forward(factor, innovation.value)
+        updated = RootState(state.time, state.mean + crossed @ white, root)
+        return updated, unjudged(innovation, mask)
 
     def estimate(params: Any, state: RootState) -> Gaussian:
         del params
         return Gaussian(state.mean, state.root @ state.root.T)
 
-    return Estimator(init, predict, update, estimate)
+    recursion = Recursion("square_root", start, move, measure, estimate, model=model)
+    return estimator_from(recursion._replace(estimated=("mean", "root")))

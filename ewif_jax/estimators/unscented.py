@@ -8,12 +8,14 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.covariance import CovarianceState, covariance_form
 from ewif_jax.recursions.sigma_points import SigmaPoints, measure_around, move_around, transform
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
 
 
+@from_recipe
 def unscented(
     model: Model, ut_alpha: Any = 1.0, ut_beta: Any = 0.0, ut_kappa: Any = 0.0
 ) -> Estimator:

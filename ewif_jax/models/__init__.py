@@ -6,18 +6,16 @@ from ewif_jax.models.kinematic import (
     constant_velocity,
     random_walk,
 )
-from ewif_jax.models.model import (
-    Linear,
-    Model,
+from ewif_jax.models.linearise import (
     affine_flow,
-    flow,
-    linear_model,
     observation,
     patterns,
-    resolve,
-    sight,
+    predict_measurement,
+    predict_state,
     size,
 )
+from ewif_jax.models.model import Linear, Model, linear_model
+from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bearing_sensor, position_sensor, wrap_angle
 
 __all__ = [
@@ -29,14 +27,14 @@ __all__ = [
     "constant_acceleration",
     "constant_velocity",
     "coordinated_turn",
-    "flow",
     "linear_model",
     "observation",
     "patterns",
     "position_sensor",
+    "predict_measurement",
+    "predict_state",
     "random_walk",
     "resolve",
-    "sight",
     "size",
     "wrap_angle",
 ]

@@ -8,8 +8,11 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, resolve
+from ewif_jax.models import domain
+from ewif_jax.models.model import Model
+from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 STRAIGHT = np.zeros((3, 5, 5))
 STRAIGHT[:, :4, :4] = [
@@ -20,6 +23,7 @@ STRAIGHT[:, :4, :4] = [
 TURNING = np.diag([0.0, 0.0, 0.0, 0.0, 1.0])
 
 
+@from_recipe
 def coordinated_turn(
     *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, q_turn: Any = 0.0
 ) -> Model:
@@ -58,9 +62,9 @@ def coordinated_turn(
     """
     for argument, density in (("q", q), ("q_turn", q_turn)):
         if not callable(density):
-            checks.shape(argument, density, ())
-            checks.at_least(argument, density, 0.0)
+            domain.check_variance(argument, density)
     observe, cov, residual, _, count = bank(sensors)
+    check_seen = domain.check_covariances(None, cov)
 
     def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
         del params
@@ -84,9 +88,16 @@ def coordinated_turn(
         dt = jnp.abs(jnp.asarray(t1 - t0))
         straight, turning = jnp.asarray(STRAIGHT, dt.dtype), jnp.asarray(TURNING, dt.dtype)
         moving = straight[0] * dt + straight[1] * dt**2 + straight[2] * dt**3
-        return resolve(q, params) * moving + resolve(q_turn, params) * dt * turning
+        driven = domain.scaled(domain.variance("q", q, params), moving)
+        turned = domain.scaled(domain.variance("q_turn", q_turn, params), dt * turning)
+        return driven + turned.astype(driven.dtype)
 
-    return Model(transition, process_cov, observe, cov, residual, sensors=count)
+    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+        for argument, density in (("q", q), ("q_turn", q_turn)):
+            domain.check_variance(argument, resolve(density, params))
+        check_seen(params, t0, t1, sensors)
+
+    return Model(transition, process_cov, observe, cov, residual, sensors=count, check=check)
 
 
 def _sinc(a: Array) -> Array:

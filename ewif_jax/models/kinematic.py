@@ -15,12 +15,16 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.batched import kernel
 from ewif_jax.fast.sparse import Pattern, pattern
-from ewif_jax.models.model import Linear, Model, affine_motion, resolve
+from ewif_jax.models import domain
+from ewif_jax.models.model import Linear, Model, affine_motion
+from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 Function = Callable[[Array], Array]
 
 
+@from_recipe
 def random_walk(
     *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, dims: int = 1, b: Any = None
 ) -> Model:
@@ -28,6 +32,7 @@ def random_walk(
     return _kinematic(0, sensors, q, dims, "white", b)
 
 
+@from_recipe
 def constant_velocity(
     *,
     sensors: Sensor | Sequence[Sensor],
@@ -52,6 +57,7 @@ def constant_velocity(
     return _kinematic(1, sensors, q, dims, noise, b)
 
 
+@from_recipe
 def constant_acceleration(
     *,
     sensors: Sensor | Sequence[Sensor],
@@ -76,10 +82,10 @@ def _kinematic(
     checks.whole("dims", dims, 1)
     checks.require(noise in ("white", "discrete"), "noise", "'white' or 'discrete'", repr(noise))
     if not callable(q):
-        checks.shape("q", q, ())
-        checks.at_least("q", q, 0.0)
+        domain.check_variance("q", q)
     n = (order + 1) * dims
     observe, cov, residual, matrix, count = bank(sensors)
+    check_seen = domain.check_covariances(None, cov)
     motion, spread, F_where = _matrices(order, dims, noise)
 
     def F(params: Any, t0: Array, t1: Array) -> Array:
@@ -87,14 +93,18 @@ def _kinematic(
         return motion(_interval(t0, t1))
 
     def process_cov(params: Any, t0: Array, t1: Array) -> Array:
-        return resolve(q, params) * spread(_interval(t0, t1))
+        return domain.scaled(domain.variance("q", q, params), spread(_interval(t0, t1)))
+
+    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+        domain.check_variance("q", resolve(q, params))
+        check_seen(params, t0, t1, sensors)
 
     linear = None
     if matrix is not None:
         H, H_where = matrix(n)
         linear = Linear(F, b, H, F_where, H_where)
     transition = affine_motion(F, b)
-    return Model(transition, process_cov, observe, cov, residual, linear, count)
+    return Model(transition, process_cov, observe, cov, residual, linear, count, check=check)
 
 
 def _interval(t0: Any, t1: Any) -> Array:

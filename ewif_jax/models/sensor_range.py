@@ -5,7 +5,7 @@ for another sensor. Where the index is known now it is checked: against the numb
 model knows it, else by evaluating what the model sees with JAX's index checks.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,12 @@ from jax.experimental import checkify
 from jax.extend.core import jaxpr_as_fun
 
 from ewif_jax import checks
+from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.models.model import Model
+from ewif_jax.recipe import digest
 
-if TYPE_CHECKING:
-    from ewif_jax.models.model import Model
 
-
-def check_sensor(model: "Model", params: Any, x: Any, sensor: Any, t: Any) -> None:
+def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None:
     """Refuses a known index that the model has no sensor for, or that it clamps where it looks
     something up; a linear model does not need to know the state x."""
     index = checks.known(sensor)
@@ -36,33 +36,29 @@ def check_sensor(model: "Model", params: Any, x: Any, sensor: Any, t: Any) -> No
         )
 
 
-def _inside(model: "Model", index: int, inputs: tuple) -> bool:
+def _inside(model: Model, index: int, inputs: tuple) -> bool:
     """Whether the model has what it looks up for this index, asked once: the answer depends on the
     sizes of tables, and on whole numbers that may be indices too."""
-    functions = model.linear, model.observe, model.measurement_cov
+    functions = question_of(model.linear, model.observe, model.measurement_cov)
     leaves, tree = jax.tree.flatten(inputs)
-    asked = (*map(id, functions), index, tree, *map(_size_or_index, leaves))
-    if asked not in _answers:
-        if len(_answers) >= 1000:
-            _answers.clear()
+    # Functions that are gone answer to no question, so they need not be kept.
+    question = _inside, functions, index, tree, *map(_size_or_index, leaves)
+
+    def looks_inside() -> bool:
         examples = jax.tree.map(_example, inputs)
-        inside = not _clamps(model, index, examples) or _clamps(model, 0, examples)
-        _answers[asked] = inside, functions
-    return _answers[asked][0]
+        return not _clamps(model, index, examples) or _clamps(model, 0, examples)
 
-
-_answers: dict[Any, tuple[bool, Any]] = {}
-"""With the functions that were asked, which keeps others from getting their identities."""
+    return remembered(question, looks_inside)
 
 
 def _size_or_index(x: Any) -> Any:
     aval = jax.typeof(x)
     integer = jnp.issubdtype(aval.dtype, jnp.integer) or aval.dtype == bool
     known = checks.known(x) if integer else None
-    return aval if known is None else (aval, known.tobytes())
+    return aval if known is None else (aval, digest(known))
 
 
-def _clamps(model: "Model", index: int, inputs: tuple) -> bool:
+def _clamps(model: Model, index: int, inputs: tuple) -> bool:
     """Whether an index goes out of range in what the model sees, computed now even inside a trace.
 
     The checks are traced on their own first: they see nothing when traced in eager evaluation.

@@ -10,19 +10,25 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.sparse import Pattern, pattern
-from ewif_jax.models.model import resolve, select
+from ewif_jax.models import domain
+from ewif_jax.models.parameters import resolve
+from ewif_jax.models.tables import select
+from ewif_jax.recipe import FromRecipe, from_recipe
 
 
-class Sensor(NamedTuple):
-    """One sensor: observe(params, x, t) -> (m,), cov(params, t) -> (m, m), which of its m
-    components are angles, and matrix(n) -> (m, n) if it is linear."""
-
+class _Sensor(NamedTuple):
     observe: Callable[..., Array]
     cov: Callable[..., Array]
     angle: tuple[bool, ...]
     matrix: Callable[[int], np.ndarray] | None = None
 
 
+class Sensor(FromRecipe, _Sensor):
+    """One sensor: observe(params, x, t) -> (m,), cov(params, t) -> (m, m), which of its m
+    components are angles, and matrix(n) -> (m, n) if it is linear."""
+
+
+@from_recipe
 def position_sensor(r: Any, dims: int = 1) -> Sensor:
     """A sensor of the first `dims` state components (the position).
 
@@ -38,6 +44,7 @@ def position_sensor(r: Any, dims: int = 1) -> Sensor:
     return Sensor(observe, _covariance(r, dims), (False,) * dims, lambda n: np.eye(dims, n))
 
 
+@from_recipe
 def bearing_sensor(r: Any, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
     r"""A sensor of the direction to the target, :math:`\mathrm{atan2}(y - y_s, x - x_s)`, radians.
 
@@ -72,12 +79,15 @@ def _covariance(r: Any, m: int) -> Callable[..., Array]:
             checks.psd("r", r)
             checks.shape("r", r, (m, m))
         else:
-            checks.shape("r", r, ())
-            checks.at_least("r", r, 0.0)
+            domain.check_variance("r", r)
 
     def cov(params: Any, t: Array) -> Array:
-        value = jnp.asarray(resolve(r, params))
-        return value if value.ndim == 2 else value * jnp.eye(m, dtype=value.dtype)
+        value = resolve(r, params)
+        if np.ndim(value) == 2:
+            checks.shape("r", value, (m, m))
+            return jnp.asarray(domain.covariance("r", value))
+        value = domain.floating(domain.variance("r", value, params))
+        return value * jnp.eye(m, dtype=value.dtype)
 
     return cov
 

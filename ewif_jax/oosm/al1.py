@@ -2,9 +2,11 @@
 
 from ewif_jax.models import Model
 from ewif_jax.oosm.history import one_step
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def al1(model: Model, lag: int) -> Estimator:
     r"""The Kalman filter that takes a late measurement in one step over up to `lag` update times.
 

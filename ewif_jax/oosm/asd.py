@@ -12,8 +12,9 @@ from ewif_jax.fast import slots
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, gaussian, symmetric, window
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.innovations import Compared, sound
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
@@ -31,6 +32,7 @@ class WindowState(NamedTuple):
     share: Array | None = None
 
 
+@from_recipe
 def asd(model: Model, lag: int) -> Estimator:
     r"""The filter of the joint density of the states at the last `lag` measurements and now.
 
@@ -96,7 +98,7 @@ def asd(model: Model, lag: int) -> Estimator:
     def predict(params: Any, state: WindowState, time: Array) -> WindowState:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
+        mean, F, Q = predict_state(model, params, state.mean, state.time, ahead)
         known = time >= state.time
         cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
         mean = jnp.where(known, mean, jnp.nan)
@@ -115,7 +117,9 @@ def asd(model: Model, lag: int) -> Estimator:
         at = mean
         if model.linear is None:
             at = mean + symmetric.times(cov, window.force(state.kept, first, after))
-        predicted, H, R = sight(model, params, at, measurement.sensor, measurement.time)
+        predicted, H, R = predict_measurement(
+            model, params, at, measurement.sensor, measurement.time
+        )
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
         seen = Compared(difference, H, R, measurement.mask & known)
@@ -155,7 +159,7 @@ def asd(model: Model, lag: int) -> Estimator:
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)
 
 
 def _split(
@@ -169,12 +173,12 @@ def _split(
     start, mean, cov = (slots.picked(x, here) for x in kept[:3])
     end = jnp.where(place < count, slots.picked(kept.time, index == place), state.time)
     time = jnp.clip(time, start, state.time)
-    mean, F, Q = flow(model, params, mean, start, time)
+    mean, F, Q = predict_state(model, params, mean, start, time)
     cov = symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
     mean, cov, F = choose(
         time < state.time, (mean, cov, F), (state.mean, state.cov, state.F)
     )  # in sequence exactly what the filter has
-    return mean, cov, F, flow(model, params, mean, time, end)[1]
+    return mean, cov, F, predict_state(model, params, mean, time, end)[1]
 
 
 def _solved(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:

@@ -2,9 +2,11 @@
 
 from ewif_jax.models import Model
 from ewif_jax.oosm.history import one_step
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def bl1(model: Model, lag: int) -> Estimator:
     r"""The filter of `al1` that retrodicts as if there had been no process noise.
 

@@ -3,11 +3,12 @@
 from typing import Any
 
 from ewif_jax import checks
-from ewif_jax.kernels.trees import choose
-from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
+from ewif_jax.recursions.contract import offered
 from ewif_jax.types import Estimator, Info, Measurement
 
 
+@from_recipe
 def drop_late(estimator: Estimator) -> Estimator:
     """The estimator that uses a measurement only if it is not older than the state.
 
@@ -25,9 +26,10 @@ def drop_late(estimator: Estimator) -> Estimator:
     kind = type(estimator).__name__
     checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
 
-    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
-        late = measurement.time < state.time
-        updated, info = estimator.update(params, state, measurement)
-        return choose(late, state, updated), too_late(info, late)
+    init, predict, take, estimate = estimator[:4]
 
-    return estimator._replace(update=update)
+    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+        in_sequence = measurement.time >= state.time
+        return offered(take, params, state, measurement, in_sequence)
+
+    return Estimator(init, predict, update, estimate, model=estimator.model)

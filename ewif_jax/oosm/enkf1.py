@@ -5,10 +5,12 @@ from typing import Any
 from jax import Array
 
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.types import Estimator
 
 
+@from_recipe
 def enkf1(model: Model, members: int, lag: int) -> Estimator:
     r"""The ensemble filter that relates a late measurement to now through stored members.
 

@@ -7,6 +7,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
 from ewif_jax.types import Estimator
@@ -14,6 +15,7 @@ from ewif_jax.types import Estimator
 NOISES = ("fresh", "shared")
 
 
+@from_recipe
 def enkf2(
     model: Model, members: int, lag: int, noise: Literal["fresh", "shared"] = "fresh"
 ) -> Estimator:

@@ -11,7 +11,8 @@ from ewif_jax.fast import slots
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
+from ewif_jax.models.linearise import need_reversible
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.covariance import CovarianceState, covariance_form
 from ewif_jax.recursions.innovations import Compared, updated
@@ -51,6 +52,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
     Times without a used measurement are not stored. The prior at t0 is the first entry.
     """
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
+    need_reversible(model, method)
     lag = checks.whole("lag", lag, 1)
     form = covariance_form(model, method)
 
@@ -78,7 +80,7 @@ def one_step(model: Model, method: str, lag: int, noise_estimated: bool) -> Esti
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)
 
 
 def last_before(past: CovarianceState, time: Array) -> tuple[Array, CovarianceState]:
@@ -100,15 +102,15 @@ def late_update(
     """Mean and packed covariance of now after a measurement of a time between `start` and now."""
     dtype = state.mean.dtype
     at = jnp.clip(measurement.time, start.time, state.time)
-    predicted, F, Q_all = flow(model, params, start.mean, start.time, state.time)
+    predicted, F, Q_all = predict_state(model, params, start.mean, start.time, state.time)
     F_where, H_where = patterns(model)
     M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
     moved, origin = state.mean - predicted, state.mean
     if noise_estimated and model.linear is None:
         origin = origin - matvec(Q, cholesky.solved(symmetric.unpack(M), moved))
-    there, back, _ = flow(model, params, origin, state.time, at)
-    value, H, R = sight(model, params, there, measurement.sensor, measurement.time)
+    there, back, _ = predict_state(model, params, origin, state.time, at)
+    value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     seen = matmul(H, back, H_where)
     noisy = matmul(seen, Q)

@@ -11,7 +11,8 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, flow
+from ewif_jax.models import Model, predict_state
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.particles import ParticleState
@@ -32,6 +33,7 @@ class PathState(NamedTuple):
     past: Array
 
 
+@from_recipe
 def pf_extended(
     model: Model,
     particles: int,
@@ -126,7 +128,7 @@ def pf_extended(
         past = lax.cond(follow, lambda x: x[..., order], lambda x: x, state.past)
         return state._replace(**cloud._asdict(), used=state.used | used, past=past), info
 
-    return Estimator(init, predict, update, form.estimate)
+    return Estimator(init, predict, update, form.estimate, model=model)
 
 
 def _between(
@@ -143,8 +145,8 @@ def _between(
     time = jnp.clip(time, start, end)
 
     def draw(x: Array, target: Array, normals: Array) -> Array:
-        there, _, Q_before = flow(model, params, x, start, time)
-        arrived, F, Q_after = flow(model, params, there, time, end)
+        there, _, Q_before = predict_state(model, params, x, start, time)
+        arrived, F, Q_after = predict_state(model, params, there, time, end)
         gain, left_over = retrodiction.bridge(Q_before, F, Q_after)
         root = cholesky.factor(left_over).lower
         return there + matvec(gain, target - arrived) + matvec(root, normals)

@@ -11,8 +11,9 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, sight
+from ewif_jax.models import Model, predict_measurement
 from ewif_jax.oosm.history import last_before
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
@@ -39,6 +40,7 @@ class SummaryState(NamedTuple):
     measured: Measurement
 
 
+@from_recipe
 def pf_fixed_point(
     model: Model,
     particles: int,
@@ -149,7 +151,7 @@ def pf_fixed_point(
         weighed = state._replace(log_weights=log_weights, key=key)
         return choose(weighing.was_used(info), _remembered(weighed, measurement), state), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
 
 
 def _size(model: Model, params: Any, at: CovarianceState) -> int:
@@ -166,7 +168,7 @@ def _look_through(
 
     def seen_through(x: Array) -> tuple[Array, Array, Array, Array, Array]:
         there = given(past, x)
-        predicted, H, R = sight(model, params, there.mean, sensor, time)
+        predicted, H, R = predict_measurement(model, params, there.mean, sensor, time)
         checks.shape("measurement.value", value, (R.shape[0],))
         difference = jnp.where(mask, model.residual(value, predicted, sensor), 0)
         cov = gaussian.mask_cov(matmul(matmul(H, there.cov), H.T) + R, mask)

@@ -8,12 +8,14 @@ from jax import Array, lax
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def pf_retrodict(
     model: Model,
     particles: int,
@@ -79,4 +81,4 @@ def pf_retrodict(
         updated = drawn._replace(log_weights=log_weights)
         return choose(weighing.was_used(info), updated, state), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate)
+    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)

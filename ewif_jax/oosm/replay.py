@@ -9,9 +9,10 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.arrival import arrive
 from ewif_jax.kernels.trees import choose
-from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.partial_use import partly
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 class ReplayState(NamedTuple):
@@ -28,6 +29,7 @@ class ReplayState(NamedTuple):
     shares: Array | None = None
 
 
+@from_recipe
 def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     """The estimator as it would be had every measurement come in order of validity time.
 
@@ -57,7 +59,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     lag = checks.whole("lag", lag, 1)
     width = checks.whole("width", width, 1)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ReplayState:
+    def start(params: Any, prior: Gaussian | None, t0: Any, key: Any) -> ReplayState:
         first = estimator.init(params, prior, t0, key)
         time = first.time
         nothing = Measurement(
@@ -68,11 +70,15 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         )
         return ReplayState(time, first, first, nothing, jnp.zeros((), time.dtype))
 
-    def predict(params: Any, state: ReplayState, time: Array) -> ReplayState:
+    def move(params: Any, state: ReplayState, time: Array) -> ReplayState:
         current = estimator.predict(params, state.current, time)
         return state._replace(time=current.time, current=current)
 
-    def update(
+    def is_after_base(params: Any, state: ReplayState, time: Array) -> Array:
+        del params
+        return time >= state.base.time
+
+    def measure(
         params: Any, state: ReplayState, measurement: Measurement
     ) -> tuple[ReplayState, Info]:
         size = jnp.shape(measurement.value)[0]
@@ -83,7 +89,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         stored, share = (None, None) if shares is None else (shares[:-1], shares[-1])
         sorted_in, place = _insert((state.buffer, stored), (_padded(measurement, width), share))
 
-        def one(at: Any, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
+        def filtered(at: Any, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
             measured, share = entry
             cut = measured._replace(value=measured.value[:size], mask=measured.mask[:size])
             method = estimator if share is None else partly(estimator, share)
@@ -91,32 +97,28 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
             return moved.kept, moved.info
 
         oldest, rest = (jax.tree.map(lambda x, k=k: x[k], sorted_in) for k in (0, slice(1, None)))
-        base, first = one(state.base, oldest)
-        last, others = lax.scan(one, base, rest)
+        base, first = filtered(state.base, oldest)
+        last, others = lax.scan(filtered, base, rest)
         ahead = state.time > last.time
         current = choose(ahead, estimator.predict(params, last, state.time), last)
         infos = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
         total = jnp.sum(infos.log_likelihood).astype(state.evidence.dtype)
-        late = measurement.time < state.time
-        present = jnp.any(measurement.mask)
-        known = measurement.time >= state.base.time
         info = jax.tree.map(lambda x: x[place], infos)
-        used_late = late & (info.status == Status.USED)
-        info = info._replace(
-            log_likelihood=jnp.where(present, total - state.evidence, 0),
-            delay=state.time - measurement.time,
-            status=jnp.where(used_late, jnp.int32(Status.LATE_USED), info.status),
-        )
+        info = info._replace(log_likelihood=total - state.evidence)
         evidence = total - infos.log_likelihood[0]
         buffer, stored = rest
         shares = None if stored is None else jnp.append(stored, jnp.ones_like(stored[:1]))
-        updated = ReplayState(state.time, current, base, buffer, evidence, shares)
-        return choose(known & present, updated, state), too_late(info, ~known)
+        return ReplayState(state.time, current, base, buffer, evidence, shares), info
 
     def estimate(params: Any, state: ReplayState) -> Gaussian:
         return estimator.estimate(params, state.current)
 
-    return Estimator(init, predict, update, estimate)
+    method = Recursion(
+        "replay", start, move, measure, estimate, is_after_base, model=estimator.model
+    )
+    # What it wraps checks the prior and the key, and may predict earlier times.
+    method = method._replace(moves_back=True, starts_from_nothing=True)
+    return estimator_from(method._replace(model=estimator.model))
 
 
 def _padded(measurement: Measurement, width: int) -> Measurement:
@@ -133,8 +135,8 @@ def _insert(buffer: tuple[Measurement, Any], new: tuple[Measurement, Any]) -> tu
     index = jnp.arange(times.shape[0] + 1)
     source = jnp.where(index < place, index, index - 1)
 
-    def put(table: Array, row: Array) -> Array:
+    def inserted(table: Array, row: Array) -> Array:
         here = (index == place).reshape(-1, *[1] * (table.ndim - 1))
         return jnp.where(here, row[None], table[jnp.clip(source, 0, table.shape[0] - 1)])
 
-    return jax.tree.map(put, buffer, new), place
+    return jax.tree.map(inserted, buffer, new), place

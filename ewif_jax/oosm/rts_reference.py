@@ -9,8 +9,9 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models import Model, flow, patterns, sight
+from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared, updated
 from ewif_jax.types import Estimator, Info, Measurement
@@ -26,6 +27,7 @@ class Tie(NamedTuple):
     cov: Array
 
 
+@from_recipe
 def rts_reference(model: Model, lag: int) -> Estimator:
     r"""The Kalman filter that smooths back to a late measurement's time, one stored time after
     the other.
@@ -70,7 +72,9 @@ def rts_reference(model: Model, lag: int) -> Estimator:
         known, start = last_before(state.past, measurement.time)
         at = jnp.clip(measurement.time, start.time, state.time)
         tie = _tied(model, params, state, start, at)
-        predicted, H, R = sight(model, params, tie.mean, measurement.sensor, measurement.time)
+        predicted, H, R = predict_measurement(
+            model, params, tie.mean, measurement.sensor, measurement.time
+        )
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         R = R + matmul(matmul(H, symmetric.unpack(tie.cov)), H.T)
         difference = model.residual(measurement.value, predicted, measurement.sensor)
@@ -92,7 +96,7 @@ def _tied(
     n = state.mean.shape[0]
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
     nearest, _ = lax.scan(back, now, state.past)
-    mean, F, Q = flow(model, params, start.mean, start.time, time)
+    mean, F, Q = predict_state(model, params, start.mean, start.time, time)
     cov = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q)
     tie = _behind(model, params, nearest, CovarianceState(time, mean, cov))
     return choose(time < nearest.time, tie, nearest)
@@ -101,7 +105,7 @@ def _tied(
 def _behind(model: Model, params: Any, tie: Tie, slot: CovarianceState) -> Tie:
     """One smoothing step from `tie` to the estimate `slot` of an earlier time."""
     end = jnp.maximum(tie.time, slot.time)
-    predicted, F, Q = flow(model, params, slot.mean, slot.time, end)
+    predicted, F, Q = predict_state(model, params, slot.mean, slot.time, end)
     full = symmetric.unpack(slot.cov)
     cross = matmul(F, full)
     spread = matmul(cross, F.T) + Q

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from ewif_jax import checks
-from ewif_jax.kernels.trees import choose
 from ewif_jax.models import resolve
-from ewif_jax.oosm.history import too_late
+from ewif_jax.recipe import from_recipe
+from ewif_jax.recursions.contract import offered
 from ewif_jax.recursions.partial_use import partly, prepared
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
+@from_recipe
 def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Estimator:
     r"""The estimator that uses a late measurement only if it is fresh enough.
 
@@ -68,11 +69,11 @@ def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Est
         delay = state.time - measurement.time
         limit = checks.at_least("max_delay", resolve(max_delay, params), 0.0)
         if softness is None:
-            updated, info = estimator.update(params, state, measurement)
-            stale = (delay > 0) & (delay >= limit)
-            return choose(stale, state, updated), too_late(info, stale)
+            fresh = (delay <= 0) | (delay < limit)
+            return offered(estimator.update, params, state, measurement, fresh)
         width = checks.positive("softness", resolve(softness, params))
         share = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
         return partly(estimator, share.astype(state.time.dtype)).update(params, state, measurement)
 
-    return estimator._replace(init=init, update=update)
+    predict, estimate = estimator.predict, estimator.estimate
+    return Estimator(init, predict, update, estimate, model=estimator.model)

@@ -1,9 +1,158 @@
-"""What every recursion has in common: it turns plain maths into an `Estimator`."""
+"""What every filter has in common: this file turns the plain maths of one into an `Estimator`.
+
+The author of a filter writes four functions that know nothing of late data, masks or statuses
+(`Recursion`); `estimator_from` adds what the contract of the package asks for. Nothing else in the
+package decides a `Status` or what `Info` says of a measurement that was not used.
+"""
+
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jax import Array
 
-from ewif_jax.types import Status
+from ewif_jax import checks
+from ewif_jax.kernels.trees import choose
+from ewif_jax.models import Model
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+
+
+class Start(Protocol):
+    """The state at t0. `prior` is a checked `Gaussian` of arrays in one dtype (None only if the
+    recursion `starts_from_nothing`), t0 () has that dtype."""
+
+    def __call__(self, params: Any, prior: Any, t0: Array, key: Any, /) -> Any: ...
+
+
+class Move(Protocol):
+    """The state at `time`, which is not before the state's (unless the recursion `moves_back`)."""
+
+    def __call__(self, params: Any, state: Any, time: Array, /) -> Any: ...
+
+
+class Measure(Protocol):
+    """The state after a measurement, and its `Info`, of which delay and status are left to the
+    contract (status: USED, or REJECTED if the filter refuses it).
+
+    The measurement is within reach. Where its mask is False nothing was seen: with no component
+    present the innovation is 0, its covariance the identity, and the log likelihood 0.
+    """
+
+    def __call__(
+        self, params: Any, state: Any, measurement: Measurement, /
+    ) -> tuple[Any, Info]: ...
+
+
+class Report(Protocol):
+    """What is estimated of the state at its time."""
+
+    def __call__(self, params: Any, state: Any, /) -> Gaussian: ...
+
+
+class Reach(Protocol):
+    """Whether a measurement of this `time`, before the state's, can still be used, () bool."""
+
+    def __call__(self, params: Any, state: Any, time: Array, /) -> Array: ...
+
+
+class Recursion(NamedTuple):
+    """A filter in plain maths, and what it promises of itself.
+
+    name: what errors call it.
+    init, move, measure, estimate: see their protocols.
+    reach: how far back it uses late measurements; None: not at all.
+    moves_back: `move` takes times before the state's too. Otherwise they are predicted as NaN in
+        the fields `estimated` of the state.
+    model: of which the filter is one; its times are checked with it.
+    starts_from_nothing: `init` accepts prior=None.
+    draws: `init` needs a key.
+    keeps: a measurement of which nothing is present leaves the state as it is, to the last bit. A
+        batch then pays nothing for measurements that are not used; otherwise the contract selects
+        the old state for them, which costs a pass over it.
+    """
+
+    name: str
+    init: Start
+    move: Move
+    measure: Measure
+    estimate: Report
+    reach: Reach | None = None
+    moves_back: bool = False
+    starts_from_nothing: bool = False
+    draws: bool = False
+    keeps: bool = False
+    estimated: tuple[str, ...] = ("mean", "cov")
+    model: Model | None = None
+
+
+def estimator_from(recursion: Recursion) -> Estimator:
+    """The estimator of a recursion."""
+    name, start, move, measure, estimate = recursion[:5]
+
+    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> Any:
+        if not recursion.starts_from_nothing:
+            checks.needs_prior(prior, name)
+        checks.prior(prior)
+        if recursion.draws:
+            checks.needs_key(key, name)
+        if prior is None:
+            return start(params, None, _floating(t0), key)
+        mean = jnp.asarray(prior.mean)
+        given = Gaussian(mean, jnp.asarray(prior.cov, mean.dtype))
+        return start(params, given, jnp.asarray(t0, mean.dtype), key)
+
+    def predict(params: Any, state: Any, time: Array) -> Any:
+        time = jnp.asarray(time, state.time.dtype)
+        if recursion.moves_back:
+            return move(params, state, time)
+        moved = move(params, state, jnp.maximum(time, state.time))
+        forwards = time >= state.time
+        fields = {x: jnp.where(forwards, getattr(moved, x), jnp.nan) for x in recursion.estimated}
+        return moved._replace(time=time, **fields)
+
+    def take(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+        """A measurement within reach, or one of which nothing is present."""
+        updated, info = measure(params, state, measurement)
+        present, late = jnp.any(measurement.mask), measurement.time < state.time
+        accepted = info.status != Status.REJECTED
+        used = jnp.where(late, Status.LATE_USED, Status.USED)
+        status = jnp.where(accepted, used, Status.REJECTED)
+        status = jnp.where(present, status, Status.MASKED).astype(jnp.int32)
+        info = info._replace(
+            log_likelihood=jnp.where(present & accepted, info.log_likelihood, 0), status=status
+        )
+        return (updated if recursion.keeps else choose(present & accepted, updated, state)), info
+
+    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+        in_sequence = measurement.time >= state.time
+        within_reach = in_sequence
+        if recursion.reach is not None:
+            within_reach |= recursion.reach(params, state, measurement.time)
+        return offered(take, params, state, measurement, within_reach)
+
+    return Estimator(init, predict, update, estimate, model=recursion.model)
+
+
+def offered(
+    take: Measure, params: Any, state: Any, measurement: Measurement, within_reach: Array
+) -> tuple[Any, Info]:
+    """`take` of a measurement that is not shown to it unless `within_reach`: `TOO_LATE` then.
+
+    It is masked, not undone afterwards: a filter that sees nothing does nothing, so a batch has no
+    old state to keep and select.
+    """
+    shown = measurement._replace(
+        time=jnp.where(within_reach, measurement.time, state.time),
+        mask=measurement.mask & within_reach,
+    )
+    updated, info = take(params, state, shown)
+    too_late = jnp.any(measurement.mask) & ~within_reach
+    status = jnp.where(too_late, jnp.int32(Status.TOO_LATE), info.status)
+    return updated, info._replace(delay=state.time - measurement.time, status=status)
+
+
+def _floating(t0: Any) -> Array:
+    t0 = jnp.asarray(t0)
+    return t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
 
 
 def verdict(

@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, flow, patterns, sight
-from ewif_jax.recursions.contract import verdict
-from ewif_jax.recursions.innovations import Compared, updated
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.models import Model, patterns, predict_state
+from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.innovations import compared, updated
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 class CovarianceState(NamedTuple):
@@ -38,45 +37,30 @@ def covariance_form(
     keeps the covariance of a single direction a covariance.
     """
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> CovarianceState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> CovarianceState:
         del params, key
-        prior = checks.needs_prior(prior, method)
-        checks.prior(prior)
-        mean = jnp.asarray(prior.mean)
-        cov = symmetric.pack(jnp.asarray(prior.cov, mean.dtype))
-        return CovarianceState(jnp.asarray(t0, mean.dtype), mean, cov)
+        return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
-    def predict(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        mean, F, Q = flow(model, params, state.mean, state.time, ahead)
-        known = time >= state.time
-        if inflation is None:
-            cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
-        else:
-            cov = symmetric.congruence(F, state.cov, patterns(model)[0])
-            cov = _inflated(cov, inflation(params, state.time, ahead)) + symmetric.pack(Q)
-            cov = jnp.where(known, cov, jnp.nan)
-        return CovarianceState(time, jnp.where(known, mean, jnp.nan), cov)
+    def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
+        cov = symmetric.congruence(F, state.cov, patterns(model)[0])
+        if inflation is not None:
+            cov = _inflated(cov, inflation(params, state.time, time))
+        return CovarianceState(time, mean, cov + symmetric.pack(Q))
 
-    def update(
+    def measure_now(
         params: Any, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
-        late = measurement.time < state.time
-        present = jnp.any(measurement.mask)
-        used = measurement._replace(mask=measurement.mask & ~late)
-        mean, cov, info = measure(model, params, state.mean, state.cov, used)
-        info = info._replace(
-            delay=state.time - measurement.time,
-            status=verdict(late, present, good=info.status == Status.USED),
-        )
+        mean, cov, info = measure(model, params, state.mean, state.cov, measurement)
         return CovarianceState(state.time, mean, cov), info
 
     def estimate(params: Any, state: CovarianceState) -> Gaussian:
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 
-    return Estimator(init, predict, update, estimate)
+    return estimator_from(
+        Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)
+    )
 
 
 def measure(
@@ -86,10 +70,8 @@ def measure(
     (delay 0, status USED or REJECTED). The last `still` components of the state are not the
     model's, which neither moves nor sees them."""
     moving = mean[: mean.shape[0] - still]
-    predicted, H, R = sight(model, params, moving, measurement.sensor, measurement.time)
-    checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    difference = model.residual(measurement.value, predicted, measurement.sensor)
-    seen = Compared(difference, unseen(H, still), R, measurement.mask)
+    seen = compared(model, params, moving, measurement)
+    seen = seen._replace(H=unseen(seen.H, still))
     where = patterns(model)[1]
     if where is not None:
         where = tuple(row + (False,) * still for row in where)

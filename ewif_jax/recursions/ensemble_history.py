@@ -110,7 +110,7 @@ def delayed(
         del params
         return ensembles.moments(state.now.members)
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)
 
 
 def _pushed(past: Slots, left: ensembles.EnsembleState, now: ensembles.EnsembleState) -> Slots:

@@ -17,7 +17,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import transposed
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.models import Model
-from ewif_jax.models.model import affine_flow, observation, patterns, size
+from ewif_jax.models.linearise import affine_flow, observation, patterns, size
 from ewif_jax.types import Gaussian, Info, Measurement
 
 

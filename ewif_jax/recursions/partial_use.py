@@ -42,7 +42,8 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
             updated = _mixed(state, updated, share)
         return updated, info._replace(log_likelihood=share * info.log_likelihood)
 
-    return estimator._replace(update=update)
+    init, predict, _, estimate = estimator[:4]
+    return Estimator(init, predict, update, estimate, model=estimator.model)
 
 
 def _mixed(old: Any, new: Any, share: Array) -> Any:

@@ -13,7 +13,8 @@ from jax import Array
 
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import symmetric
-from ewif_jax.models.model import Model, affine_flow
+from ewif_jax.models.linearise import affine_flow
+from ewif_jax.models.model import Model
 from ewif_jax.recursions.information import InformationState
 
 

@@ -11,11 +11,12 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.model import Model, flow, patterns, resolve
+from ewif_jax.models.linearise import patterns, predict_state
+from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
-from ewif_jax.recursions.innovations import Compared, info_of, numbers, updated
-from ewif_jax.types import Info, Measurement
+from ewif_jax.recursions.innovations import Compared, numbers, unjudged, updated
+from ewif_jax.types import Info, Measurement, Status
 
 ROUNDING = 1e-4
 """The largest share of a value that the weights may turn rounding into."""
@@ -79,7 +80,7 @@ def flow_around(
     """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0: of
     all but the last `still` components, which do not move."""
     if points is None or model.linear is not None:
-        return flow(model, params, mean[: mean.shape[0] - still], t0, t1)
+        return predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
     root = _root(cov, mean.shape[0] - still)
     moved, line = _moved(model, points, params, mean, root.lower, t0, t1, still)
     Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
@@ -91,7 +92,7 @@ def move_around(
 ) -> tuple[Array, Array]:
     """Mean (n,) and packed covariance at t1 of a Gaussian at t0 with a packed `cov`."""
     if model.linear is not None:
-        moved, F, Q = flow(model, params, mean, t0, t1)
+        moved, F, Q = predict_state(model, params, mean, t0, t1)
         return moved, symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
     lower = _fine_root(cov, mean.shape[0])
     moved, line = _moved(model, points, params, mean, lower, t0, t1)
@@ -131,7 +132,8 @@ def measure_around(
     difference, slope, R = (jnp.where(good, x, 0) for x in (difference, slope, R))
     mask = mask & good
     mean, cov, innovation = sigma_points.update(mean, lower, difference, slope, R, mask)
-    return mean, cov, info_of(innovation, mask, good)
+    info = unjudged(innovation, mask)
+    return mean, cov, info._replace(status=jnp.where(good, info.status, jnp.int32(Status.REJECTED)))
 
 
 def _root(cov: Array, n: int) -> cholesky.Factor:

@@ -11,6 +11,7 @@ from jax import Array
 from ewif_jax import checks, models
 from ewif_jax.models import Model, Sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, uniform_delays
 from ewif_jax.types import Measurement
 
@@ -37,6 +38,7 @@ def arbitrary_noise(sensor: Any, time: Any) -> Array:
     return low + (high - low) * (1 + phase) / 2
 
 
+@from_recipe
 def arbitrary_target_model(q: Any = 0.0) -> Model:
     """Constant acceleration in two dimensions, the paper's model; sensor 0 is prompt, 1 late."""
 
@@ -50,6 +52,7 @@ def arbitrary_target_model(q: Any = 0.0) -> Model:
     return models.constant_acceleration(sensors=[sensor(0), sensor(1)], q=q, dims=2)
 
 
+@from_recipe
 def arbitrary_target(lag: float = 0.0, late_used: bool = True) -> Scenario:
     """A minute of the target. Both the noise and the sampling interval of the sensors vary along
     the way; sensor 1 arrives 0.3 to 2.5 s late, sensor 0 at once.

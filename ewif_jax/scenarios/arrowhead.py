@@ -9,6 +9,7 @@ from jax import Array, lax
 from ewif_jax import checks, models
 from ewif_jax.models import Model, position_sensor, wrap_angle
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, exponential_delays, regular_times
 from ewif_jax.types import Gaussian
 
@@ -41,12 +42,14 @@ def arrowhead_state(time: Any) -> Array:
     return jnp.concatenate([position, speed, heading], -1)
 
 
+@from_recipe
 def arrowhead_model(q: Any = 20.0, r: Any = 2000.0) -> Model:
     """The random walk (no velocity) that follows the path in section 4.2; q in m^2/s and r in m^2,
     numbers or functions of `params`."""
     return models.random_walk(sensors=position_sensor(r, dims=2), q=q, dims=2)
 
 
+@from_recipe
 def arrowhead(
     r: float = 2000.0, dt: float = 1.0, mean_delay: float = 5.0, steps: int = 10_000
 ) -> Scenario:
@@ -59,6 +62,7 @@ def arrowhead(
     return _delayed(arrowhead_path, (r, r), dt, mean_delay, steps)
 
 
+@from_recipe
 def arrowhead_ekf_model(q: Any = EKF_Q, r: Any = EKF_R) -> Model:
     r"""Position, speed and heading with all four measured: the model of section 4.3.
 
@@ -97,6 +101,7 @@ def arrowhead_ekf_model(q: Any = EKF_Q, r: Any = EKF_R) -> Model:
     )
 
 
+@from_recipe
 def arrowhead_ekf(
     r: tuple[float, float, float, float] = EKF_R,
     dt: float = 1.0,

@@ -17,6 +17,7 @@ from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.models import position_sensor, random_walk
 from ewif_jax.models.model import resolve
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
 Remedy = Literal["none", "noise", "weighting", "memory"]
@@ -70,6 +71,7 @@ def divergence_curve(
     return _error(_growth(remedy, time, setting), push, eps)
 
 
+@from_recipe
 def divergence_filter(remedy: Remedy, *, dt: float, setting: Any = None) -> Estimator:
     """The filter with a remedy, for the samples of `divergence`.
 
@@ -96,6 +98,7 @@ def divergence_filter(remedy: Remedy, *, dt: float, setting: Any = None) -> Esti
     return fading(still, inflation=inflation)
 
 
+@from_recipe
 def divergence(push: Push, *, eps: float, dt: float = 0.02, length: float = 20.0) -> Scenario:
     """The pushed scalar, sampled every `dt` s for `length` s with noise variance 1 / dt, so that
     the filters tend to the continuous ones as dt goes to 0; the prior is N(0, 1) at t = 0.

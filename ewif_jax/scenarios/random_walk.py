@@ -9,16 +9,19 @@ from jax import Array, lax
 from ewif_jax import checks, models
 from ewif_jax.models import Model, position_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, exponential_delays, poisson_times
 from ewif_jax.types import Gaussian
 
 
+@from_recipe
 def random_walk_model(q: Any = 25.0, r: Any = 2500.0) -> Model:
     """The model that is right for `random_walk`; q in m^2/s and r in m^2, numbers or functions of
     `params`."""
     return models.random_walk(sensors=position_sensor(r), q=q)
 
 
+@from_recipe
 def random_walk(
     q: Any = 25.0,
     r: float = 2500.0,

@@ -7,9 +7,11 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.models import Model, linear_model
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Measurement
 
 
+@from_recipe
 def sine_model(r: float = 0.5) -> Model:
     """A scalar that stands still, with process noise params["sigma_w"] per sample and measurement
     variance `r`: the wrong model by which the paper tracks the sine."""
@@ -32,6 +34,7 @@ def sine_signal(
     return time, amplitude * jnp.sin(2 * jnp.pi * frequency * time)[:, None]
 
 
+@from_recipe
 def sine(
     amplitude: float = 1.0,
     frequency: float = 0.1,

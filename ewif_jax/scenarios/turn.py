@@ -11,6 +11,7 @@ from jax import Array
 from ewif_jax import checks, models
 from ewif_jax.models import Model, Sensor, bearing_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Gaussian, Measurement
 
 PROMPT, LATE = ((-200.0, 0.0), (200.0, 0.0)), (-750.0, 750.0)
@@ -31,6 +32,7 @@ def turn_state(time: Any) -> Array:
     return jnp.stack([*place, SPEED * s, SPEED * c, jnp.full_like(time, -SPEED / RADIUS)], -1)
 
 
+@from_recipe
 def turn_model(q: Any = Q, q_turn: Any = Q_TURN, r: Any = NOISE_SD**2) -> Model:
     """A coordinated turn; "sensor" 0 is the pair of bearings from (-200, 0) m and (200, 0) m, and 1
     is the bearing from (-750, 750) m (its second component is always absent).
@@ -45,6 +47,7 @@ def turn_model(q: Any = Q, q_turn: Any = Q_TURN, r: Any = NOISE_SD**2) -> Model:
     return models.coordinated_turn(sensors=[pair, _side_by_side(late, late)], q=q, q_turn=q_turn)
 
 
+@from_recipe
 def turn(
     probability: float = 0.7,
     max_delay: float = 5.0,

@@ -12,6 +12,7 @@ from jax import Array, lax
 from ewif_jax import checks, models
 from ewif_jax.models import Model, bearing_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
+from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Gaussian, Measurement
 
 SENSORS = ((-200.0, 0.0), (200.0, 0.0))
@@ -25,6 +26,7 @@ FINE = 0.05
 HALVINGS = 40
 
 
+@from_recipe
 def two_bearings_model(q: Any = Q, r: Any = NOISE_SD**2) -> Model:
     """Constant velocity in the plane, seen by bearing sensors at (-200, 0) m and (200, 0) m.
 
@@ -47,6 +49,7 @@ def two_bearings_path(key: Array, time: Any, q: float = Q, length: float = LENGT
     return _at(_flight(motion, q, length), jnp.asarray(time))
 
 
+@from_recipe
 def two_bearings(
     delay: float = 0.0, *, q: float = Q, noise_sd: float = NOISE_SD, length: float = LENGTH
 ) -> Scenario:

@@ -11,7 +11,10 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.model import Model, affine_flow, need_linear, observation
+from ewif_jax.models.entry import check_covariances_of, check_span, check_times
+from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible, observation
+from ewif_jax.models.model import Model
+from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
@@ -62,12 +65,17 @@ def batch_wls(
         model and W = 1 inside a window (5).
     """
     need_linear(model, "batch_wls")
+    need_reversible(model, "batch_wls")
     checks.stream(measurements)
     checks.sensors(measurements, model.sensors)
     checks.shape("times", times, ("K",))
     checks.finite("times", times)
     checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
     dtype = float_dtype(measurements.value)
+    check_times(model, measurements, t0, dtype, times, in_order=False)
+    check_span(model, (measurements.time, t0), times)
+    stamps = measurements.time
+    check_covariances_of(model, params, stamps, stamps, measurements.sensor)
     if prior is not None:
         checks.prior(prior)
         checks.psd("prior.cov", prior.cov, definite=True)
@@ -94,6 +102,11 @@ def _batch_wls(
     def seen_from(time: Array, measurement: Measurement) -> Array:
         """Whitened, weighted rows (m, n + 1) of one measurement: what it says of x(time), and
         its value."""
+        if model.steps is not None:
+            whole = whole_steps(model.steps, time, measurement.time)
+            measurement = measurement._replace(
+                time=jnp.where(whole, measurement.time, time), mask=measurement.mask & whole
+            )
         H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         A, c = affine_flow(model, params, time, measurement.time, dtype)

@@ -11,7 +11,9 @@ from ewif_jax.estimators.ewif import ewif
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.model import Model, flow, resolve, sight
+from ewif_jax.models.linearise import predict_measurement, predict_state
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
@@ -27,6 +29,7 @@ class LagState(NamedTuple):
     cov: Array
 
 
+@from_recipe
 def fixed_lag(model: Model, lag: int) -> Estimator:
     r"""The Kalman estimate of the state `lag` measurement times ago.
 
@@ -66,7 +69,7 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         time = jnp.asarray(time, state.time.dtype)
         ahead = jnp.maximum(time, state.time)
         n = state.mean.shape[1]
-        moved, F, Q = flow(model, params, state.mean[0], state.time, ahead)
+        moved, F, Q = predict_state(model, params, state.mean[0], state.time, ahead)
         older = state.cov[: n * (slots - 1), : n * (slots - 1)]
         cross = matmul(F, older[:n])
         newest = matmul(cross[:, :n], F.T) + Q
@@ -93,7 +96,9 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         mask = measurement.mask
         late, present = measurement.time < state.time, jnp.any(mask)
         n = state.mean.shape[1]
-        predicted, H, R = sight(model, params, state.mean[0], measurement.sensor, measurement.time)
+        predicted, H, R = predict_measurement(
+            model, params, state.mean[0], measurement.sensor, measurement.time
+        )
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         difference = model.residual(measurement.value, predicted, measurement.sensor)
         cross = matmul(H, state.cov[:n])
@@ -118,9 +123,10 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         n = state.mean.shape[1]
         return Gaussian(state.mean[-1], state.cov[-n:, -n:])
 
-    return Estimator(init, predict, update, estimate)
+    return Estimator(init, predict, update, estimate, model=model)
 
 
+@from_recipe
 def fixed_lag_ewif(
     model: Model, tau: Any = None, *, lag: Any, weight: Callable[..., Array] | None = None
 ) -> Estimator:
@@ -151,4 +157,4 @@ def fixed_lag_ewif(
         behind = checks.at_least("lag", resolve(lag, params), 0.0)
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
-    return filtered._replace(estimate=estimate)
+    return Estimator(*filtered[:3], estimate, model=model)

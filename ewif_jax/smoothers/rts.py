@@ -10,7 +10,9 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.model import Model
+from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
@@ -87,6 +89,8 @@ def rts(
     checks.shape("t0", t0, ())
     checks.finite("t0", t0)
     dtype = float_dtype(measurements.value)
+    check_times(model, measurements, t0, dtype, in_order=False)
+    check_covariances_of(model, params, t0, measurements.time, measurements.sensor)
     measurements = cast(measurements, dtype)
     times, start = checks.known(measurements.time), checks.known(t0)
     if times is not None and start is not None:
@@ -114,6 +118,11 @@ def _rts(
 
     def ahead(state: tuple[Array, Array, Array], measurement: Measurement):
         time, left, left_cov = state
+        if model.steps is not None:
+            whole = whole_steps(model.steps, time, measurement.time)
+            measurement = measurement._replace(
+                time=jnp.where(whole, measurement.time, time), mask=measurement.mask & whole
+            )
         predicted, F, Q = flow_around(model, points, params, left, left_cov, time, measurement.time)
         Q = symmetric.pack(Q)
         cov = symmetric.congruence(F, left_cov) + Q

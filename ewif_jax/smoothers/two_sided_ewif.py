@@ -8,7 +8,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.models.model import Model, need_linear, resolve
+from ewif_jax.models.entry import check_covariances_of, check_span, check_times
+from ewif_jax.models.linearise import need_linear, need_reversible
+from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import joined
@@ -57,6 +60,7 @@ def two_sided_ewif(
     Deviations: beyond the paper, whose smoothing (section VI-A) weights newer data above 1.
     """
     need_linear(model, "two_sided_ewif")
+    need_reversible(model, "two_sided_ewif")
     checks.stream(measurements)
     checks.sensors(measurements, model.sensors)
     checks.positive("tau", resolve(tau, params))
@@ -64,6 +68,11 @@ def two_sided_ewif(
     if times is not None:
         checks.shape("times", times, ("K",))
         checks.finite("times", times)
+    check_times(model, measurements, t0, dtype, times, in_order=False)
+    stamps = measurements.time
+    check_span(model, (t0,), stamps if times is None else times)
+    check_covariances_of(model, params, stamps, stamps, measurements.sensor)
+    if times is not None:
         times = jnp.asarray(times, dtype)
     if prior is not None:
         checks.prior(prior)
@@ -88,6 +97,13 @@ def _two_sided(
     times = measurements.time if times is None else times
     order = jnp.argsort(measurements.time)
     in_time = jax.tree.map(lambda x: x[order], measurements)
+    if model.steps is not None:
+        first = in_time.time[0]
+        whole = whole_steps(model.steps._replace(max_steps=2**30), first, in_time.time)
+        in_time = in_time._replace(
+            time=lax.cummax(jnp.where(whole, in_time.time, first)),
+            mask=in_time.mask & whole[:, None],
+        )
 
     def moved(state: InformationState, time: Array) -> InformationState:
         return form.transport(

@@ -1,5 +1,6 @@
 """The command `ewif-jax`."""
 
+import argparse
 import shlex
 import sys
 from collections.abc import Sequence
@@ -8,16 +9,23 @@ from importlib.util import find_spec
 import jax
 
 from ewif_jax.fast.compiling import prepare_cpu
-from ewif_jax.study.arguments import parser
-from ewif_jax.study.registry import STUDIES
+from ewif_jax.study.shared.arguments import parser
+from ewif_jax.study.shared.refusal import Refused, Stopped, listen_for_signals
+from ewif_jax.study.shared.registry import STUDIES
 
 EXTRA = ("h5netcdf", "h5py", "matplotlib", "pandas", "pyproj", "rich", "xarray")
+STOPPED = 130
 
 
 def main() -> None:
-    """Entry point: `prepare_cpu`, then `run`."""
-    prepare_cpu()
-    raise SystemExit(run(sys.argv[1:]))
+    """Entry point: `prepare_cpu`, then `run`; a signal ends it with a message."""
+    listen_for_signals()
+    try:
+        prepare_cpu()
+        status = run(sys.argv[1:])
+    except Stopped as stopped:
+        status = _complain(str(stopped), stopped.status)
+    raise SystemExit(status)
 
 
 def run(argv: Sequence[str]) -> int:
@@ -26,7 +34,24 @@ def run(argv: Sequence[str]) -> int:
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         return _complain(f'needs {", ".join(missing)}: pip install "ewif_jax[study]"', 1)
-    from ewif_jax.study.experiment import Experiment, Options, Refused
+    try:
+        # before the imports, which take seconds
+        if arguments.action == "track" and not arguments.file.is_file():
+            what = "is not a regular file" if arguments.file.exists() else "no such file"
+            raise Refused(f"{arguments.file}: {what}")
+        with jax.enable_x64(arguments.dtype == "float64"):
+            _act(arguments, shlex.join(["ewif-jax", *argv]))
+    except (Refused, OSError) as error:
+        return _complain(str(error), 2)
+    except Stopped as stopped:
+        return _complain(str(stopped), stopped.status)
+    except KeyboardInterrupt:
+        return _complain("stopped; the same command resumes what is finished", STOPPED)
+    return 0
+
+
+def _act(arguments: argparse.Namespace, command: str) -> None:
+    from ewif_jax.study.shared.experiment import Experiment, Options
 
     options = Options(
         runs=arguments.runs,
@@ -35,23 +60,17 @@ def run(argv: Sequence[str]) -> int:
         chunk=arguments.chunk,
         out=arguments.out,
         overwrite=arguments.overwrite,
-        command=shlex.join(["ewif-jax", *argv]),
+        command=command,
     )
-    try:
-        with jax.enable_x64(arguments.dtype == "float64"):
-            if arguments.action == "track":
-                from ewif_jax.study.track import track
+    if arguments.action == "track":
+        from ewif_jax.study.track.command import track
 
-                track(arguments, options)
-            else:
-                for study in STUDIES:
-                    if arguments.name in (study.name, "all"):
-                        study.load()(Experiment(study.name, options))
-    except (Refused, OSError) as error:
-        return _complain(str(error), 2)
-    except KeyboardInterrupt:
-        return _complain("stopped; the same command resumes what is finished", 130)
-    return 0
+        track(arguments, options)
+        return
+    for study in STUDIES:
+        if arguments.name in (study.name, "all"):
+            with Experiment(study.name, options) as experiment:
+                study.load()(experiment)
 
 
 def _complain(text: str, status: int) -> int:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracles import joint_gaussian, kalman_loop, late
 
-from ewif_jax.study import late_loss
+from ewif_jax.study.papers.late_loss import runs as late_loss
 
 KNOWN = {
     ("random walk", 1): ("1.219", "1.000"),

@@ -6,10 +6,10 @@ import pytest
 from apart import apart
 
 from ewif_jax.analysis.storage import storage
-from ewif_jax.study import turn as study
-from ewif_jax.study import turn_runs as runs_of
-from ewif_jax.study.claims import ratio
-from ewif_jax.study.late import mean_of, rmse
+from ewif_jax.study.papers.turn import runs as runs_of
+from ewif_jax.study.papers.turn import study
+from ewif_jax.study.shared.claims import ratio
+from ewif_jax.study.shared.late import mean_of, rmse
 
 pytestmark = pytest.mark.slow  # tests/study/test_turn_study.py runs every method, smaller
 RUNS = 24

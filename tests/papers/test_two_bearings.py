@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from apart import apart
 
-from ewif_jax.study import two_bearings as study
-from ewif_jax.study import two_bearings_runs as runs_of
-from ewif_jax.study.claims import ratio, share
-from ewif_jax.study.late import mean_of, rmse
-from ewif_jax.study.two_bearings import FIVE, NONE, TEN
+from ewif_jax.study.papers.two_bearings import runs as runs_of
+from ewif_jax.study.papers.two_bearings import study
+from ewif_jax.study.papers.two_bearings.claims import FIVE, NONE, TEN
+from ewif_jax.study.shared.claims import ratio, share
+from ewif_jax.study.shared.late import mean_of, rmse
 
 REFERENCE = {
     runs_of.EXACT: ((3.57, 0.21), (6.67, 0.26), (10.85, 0.33)),

@@ -6,8 +6,9 @@ import pytest
 
 from ewif_jax.monte_carlo import simulate_batch
 from ewif_jax.scenarios import sine, sine_model
-from ewif_jax.study import arbitrary_target, two_sided
-from ewif_jax.study.late import paired
+from ewif_jax.study.papers.arbitrary_target import study as arbitrary_target
+from ewif_jax.study.papers.two_sided import runs as two_sided
+from ewif_jax.study.shared.late import paired
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ from apart import apart
 
 import ewif_jax as ej
 from ewif_jax.scenarios import arrowhead, random_walk, random_walk_model
-from ewif_jax.study import arrowhead as heads
-from ewif_jax.study import random_walk as walks
-from ewif_jax.study.late import exact_late, history_needed, paired, rmse, rmses, sweep
+from ewif_jax.study.papers.arrowhead import study as heads
+from ewif_jax.study.papers.random_walk import study as walks
+from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse, rmses, sweep
 
 WALKS = {
     "4a": (6.04, 0.04, 4.14, 0.13, 4.01, 0.12, 3.97, 0.12),

@@ -6,8 +6,8 @@ import pytest
 import xarray as xr
 
 from ewif_jax.scenarios.divergence import PUSHES, REMEDIES, divergence_curve
-from ewif_jax.study import divergence as study
 from ewif_jax.study.cli import run
+from ewif_jax.study.papers.divergence import study
 
 
 @pytest.fixture(scope="module")

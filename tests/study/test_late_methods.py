@@ -8,7 +8,7 @@ import pytest
 
 from ewif_jax import oosm
 from ewif_jax.analysis.storage import storage
-from ewif_jax.study.late_methods import late_methods, storage_rows
+from ewif_jax.study.shared.late_methods import late_methods, storage_rows
 
 SETTING = {"lag": 5, "members": 250, "particles": 10_000}
 

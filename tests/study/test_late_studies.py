@@ -18,12 +18,12 @@ from ewif_jax.scenarios import (
     arrowhead_ekf,
     arrowhead_ekf_model,
 )
-from ewif_jax.study import arbitrary_target as arbitrary
-from ewif_jax.study import gains
-from ewif_jax.study import tuning_under_delay as tuning
 from ewif_jax.study.cli import run
-from ewif_jax.study.experiment import Experiment, Options
-from ewif_jax.study.late import history_needed, mean_of, paired, rmse, sweep
+from ewif_jax.study.papers.arbitrary_target import study as arbitrary
+from ewif_jax.study.papers.gains import study as gains
+from ewif_jax.study.papers.tuning_under_delay import study as tuning
+from ewif_jax.study.shared.experiment import Experiment, Options
+from ewif_jax.study.shared.late import history_needed, mean_of, paired, rmse, sweep
 from ewif_jax.types import Measurement
 
 FILES = {

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from ewif_jax.study import sine
 from ewif_jax.study.cli import run
+from ewif_jax.study.papers.sine import study as sine
 
 
 @pytest.fixture(scope="module")

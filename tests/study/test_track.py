@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from ewif_jax.study.cli import run
-from ewif_jax.study.readings import read
-from ewif_jax.study.track_loss import smooth_median
-from ewif_jax.study.tracks import batch, degrees
+from ewif_jax.study.track.loss import smooth_median
+from ewif_jax.study.track.readings import read
+from ewif_jax.study.track.tracks import batch, degrees
 
 PLANES = Path(__file__).parents[3] / "shared" / "data" / "opensky_plane_states.csv"
 
@@ -110,7 +110,7 @@ def test_it_is_the_plain_filter(two_tracks, tmp_path):
 def test_degrees_become_metres_and_back():
     path_like = np.array([[52.0, -1.0], [52.01, -1.02], [52.1, -0.9]])
     frame = pd.DataFrame(path_like, columns=["lat", "lon"]).assign(time=range(3))
-    from ewif_jax.study.readings import Columns, Readings
+    from ewif_jax.study.track.readings import Columns, Readings
 
     nothing = np.array([""] * 3)
     time = frame["time"].to_numpy(float)

@@ -8,9 +8,9 @@ import xarray as xr
 import ewif_jax as ej
 from ewif_jax.scenarios import turn as turn_scenario
 from ewif_jax.scenarios import turn_model
-from ewif_jax.study import turn
-from ewif_jax.study import turn_runs as runs_of
 from ewif_jax.study.cli import run
+from ewif_jax.study.papers.turn import runs as runs_of
+from ewif_jax.study.papers.turn import study as turn
 
 FILES = {
     "about.json", "claims.csv", "fig3_position.png", "fig4_velocity.png", "pareto.png",

@@ -14,11 +14,11 @@ import xarray as xr
 import ewif_jax as ej
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.scenarios import two_bearings, two_bearings_model
-from ewif_jax.study import two_bearings_runs as runs_of
-from ewif_jax.study.claims import at_any_of, claim, quotient, ratio, share, surest
 from ewif_jax.study.cli import run
-from ewif_jax.study.experiment import Measured
-from ewif_jax.study.one_by_one import over_cores, seconds_per_run, tracker
+from ewif_jax.study.papers.two_bearings import runs as runs_of
+from ewif_jax.study.shared.claims import at_any_of, claim, quotient, ratio, share, surest
+from ewif_jax.study.shared.experiment import Measured
+from ewif_jax.study.shared.one_by_one import over_cores, seconds_per_run, tracker
 
 FIGURES = {f"delay_{d}s_{kind}.png" for d in (0, 5, 10) for kind in ("tracks", "errors")}
 TABLES = {"two_bearings.csv", "claims.csv", "storage.csv"}
@@ -82,7 +82,7 @@ def test_one_after_the_other_is_a_loop():
 TWO = """
 import jax
 import numpy as np
-from ewif_jax.study.one_by_one import over_cores
+from ewif_jax.study.shared.one_by_one import over_cores
 assert len(jax.local_devices()) == 2
 keys = jax.random.split(jax.random.key(0), 5)
 found = over_cores(lambda x, key: 2 * x + 0 * jax.random.normal(key))(np.arange(5.0), keys)

@@ -1,0 +1,111 @@
+"""What a filter asks of a model: where the state will be and what a sensor will say, with the
+derivatives of both."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.fast.small import matvec
+from ewif_jax.fast.sparse import Pattern
+from ewif_jax.models.model import Linear, Model, affine
+from ewif_jax.models.sensor_range import check_sensor
+
+
+def predict_state(
+    model: Model, params: Any, x: Array, t0: Array, t1: Array
+) -> tuple[Array, Array, Array]:
+    """x at t1 (n,), the Jacobian F (n, n) of the motion at x, and Q (n, n) for t1 >= t0."""
+    Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
+    if model.linear is not None:
+        F, c = affine_flow(model, params, t0, t1, x.dtype)
+        checks.shape("F", F, (x.shape[0],) * 2)
+        moved = matvec(F, x, model.linear.F_where)
+        return (moved if c is None else moved + c), F, Q
+
+    def move(x: Array) -> Array:
+        return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
+
+    F = jax.jacfwd(move)(x)
+    checks.shape("F", F, (x.shape[0],) * 2)
+    return move(x), F, Q
+
+
+def predict_measurement(
+    model: Model, params: Any, x: Array, sensor: Array, t: Array
+) -> tuple[Array, Array, Array]:
+    """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
+    check_sensor(model, params, x, sensor, t)
+    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
+    if model.linear is not None:
+        H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
+        checks.shape("H", H, ("m", x.shape[0]))
+        checks.shape("R", R, (H.shape[0],) * 2)
+        return matvec(H, x, model.linear.H_where), H, R
+
+    def see(x: Array) -> Array:
+        return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
+
+    H = jax.jacfwd(see)(x)
+    checks.shape("R", R, (H.shape[0],) * 2)
+    return see(x), H, R
+
+
+def affine_flow(
+    model: Model, params: Any, t0: Array, t1: Array, dtype: Any
+) -> tuple[Array, Array | None]:
+    """F (n, n) and c (n,) or None of a linear model: x(t1) = F x(t0) + c, in either direction.
+
+    Against time c is derived from the forward input: c(t1, t0) = -F(t1, t0) b(t0, t1).
+    """
+    linear = need_linear(model, "this operation")
+    return affine(linear.F, linear.b, params, t0, t1, dtype)
+
+
+def observation(
+    model: Model, params: Any, sensor: Array, t: Array, dtype: Any
+) -> tuple[Array, Array]:
+    """H (m, n) and R (m, m) of a linear model."""
+    linear = need_linear(model, "this operation")
+    check_sensor(model, params, None, sensor, t)
+    H = jnp.asarray(linear.H(params, sensor, t), dtype)
+    return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
+
+
+def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:
+    """Where F and H of a model may differ from zero, if that is known."""
+    return (None, None) if model.linear is None else (model.linear.F_where, model.linear.H_where)
+
+
+def size(model: Model, params: Any, t0: Any) -> int:
+    """n, read off a linear model without computing anything."""
+    linear = need_linear(model, "prior=None")
+    return jax.eval_shape(lambda: jnp.asarray(linear.F(params, t0, t0))).shape[0]
+
+
+def need_linear(model: Model, method: str) -> Linear:
+    """The matrices of `model`, or an error that says which method wanted them."""
+    checks.require(
+        isinstance(model, Model), "model", "a Model (linear_model(...), models.*)", type(model)
+    )
+    checks.require(
+        model.linear is not None,
+        "model",
+        f"a linear model: {method} needs F and H (use `extended` for a nonlinear one)",
+        "a Model without matrices",
+    )
+    assert model.linear is not None
+    return model.linear
+
+
+def need_reversible(model: Model, method: str) -> Model:
+    """`model`, unless it is known that its motion cannot be followed back."""
+    checks.require(
+        model.linear is None or model.linear.reversible,
+        "model",
+        f"a model whose F has an inverse: {method} asks where a state came from",
+        "a singular F",
+    )
+    return model

@@ -1,0 +1,123 @@
+"""Counting the steps of a discrete-time model between two times, and refusing what is between."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ewif_jax import checks
+from ewif_jax.types import Steps
+
+SHARE = 0.01
+"""How far from a whole step a stamp may be, in steps."""
+ROUNDINGS = 4
+"""How far it may be in roundings of the times: each of two stamps and their difference have one."""
+
+
+def count_steps(steps: Steps, t0: Any, t1: Any) -> tuple[Array, Array]:
+    """The steps from t0 to t1 (int32, negative against time; 0 where they are not whole), and
+    whether they are whole."""
+    start, end = (lax.stop_gradient(_floating(t)) for t in (t0, t1))
+    interval = end - start
+    number = jnp.round(interval / steps.dt)
+    rounding = ROUNDINGS * jnp.finfo(interval.dtype).eps * jnp.maximum(abs(start), abs(end))
+    # Stamps that are each as near to a grid as they may be differ by twice as much.
+    near = jnp.maximum(2 * SHARE * steps.dt, rounding)
+    whole = (
+        (abs(interval - number * steps.dt) <= near)
+        & (abs(number) <= steps.max_steps)
+        & (rounding <= steps.dt / 4)
+    )
+    return jnp.where(whole, number, 0).astype(jnp.int32), whole
+
+
+def whole_steps(steps: Steps, t0: Any, t1: Any) -> Array:
+    """Whether the model can be asked to go from t0 to t1."""
+    return count_steps(steps, t0, t1)[1]
+
+
+def check_steps(
+    steps: Steps | None,
+    times: Any,
+    t0: Any,
+    dtype: Any,
+    argument: str = "measurements.time",
+    in_order: bool = True,
+) -> None:
+    """Refuses known times (..., T) that are not whole steps from t0 (None: from the first).
+
+    Args:
+        steps: the model's; None lets everything pass.
+        times: as they were given, before they are rounded to the filter's dtype.
+        t0: where the counting starts, so that the rounding of many intervals does not add up.
+        dtype: in which the filter will count.
+        argument: its name.
+        in_order: whether a filter goes from each to the next, and so takes `max_steps` at once.
+    """
+    given = checks.known(times)
+    start = None if t0 is None else checks.known(t0)
+    if steps is None or given is None or (start is None and t0 is not None) or not given.size:
+        return
+    stamps = np.atleast_1d(given).astype(float)
+    first = stamps[..., :1] if start is None else np.asarray(start, float)
+    larger = np.maximum(abs(stamps), abs(first))
+    rounding = ROUNDINGS * float(jnp.finfo(dtype).eps) * larger
+    lost = rounding > steps.dt / 4
+    _refuse(
+        lost,
+        f"{argument}: expected times at which {jnp.dtype(dtype).name} can count steps of "
+        f"dt = {steps.dt:g} s, got {_at(stamps, lost)}: subtract the first time, or use float64",
+    )
+    number = np.round((stamps - first) / steps.dt)
+    between = abs(stamps - first - number * steps.dt) > np.maximum(SHARE * steps.dt, rounding)
+    _refuse(
+        between,
+        f"{argument}: expected whole steps of dt = {steps.dt:g} s from {_number(first)} on, since "
+        f"constants in linear_model are a model in discrete time, got {_at(stamps, between)}"
+        f"{_spacing(stamps, between)}. Give linear_model the step of its constants as dt=, or "
+        "functions of (params, t0, t1): models.from_continuous makes them",
+    )
+    if in_order:
+        before = np.concatenate([np.zeros_like(number[..., :1]), number[..., :-1]], -1)
+        far = abs(number - np.maximum.accumulate(before, -1)) > steps.max_steps
+        _refuse(
+            far,
+            f"{argument}: expected at most max_steps = {steps.max_steps} steps of dt = "
+            f"{steps.dt:g} s at once, got {_at(stamps, far)}{_spacing(stamps, far)}. Give "
+            "linear_model a larger max_steps=",
+        )
+
+
+def _floating(t: Any) -> Array:
+    t = jnp.asarray(t)
+    return t if jnp.issubdtype(t.dtype, jnp.floating) else t.astype(jnp.result_type(float))
+
+
+def _refuse(bad: np.ndarray, message: str) -> None:
+    if bad.any():
+        raise ValueError(message)
+
+
+def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
+    """The first bad stamp and its row."""
+    if not bad.any():
+        return ""
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    run = f" of run {index[0]}" if len(index) > 1 else ""
+    return f"{stamps[index]:.10g} at row {max(index[-1:])}{run}"
+
+
+def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:
+    """The interval before the first bad stamp, and the usual one."""
+    if not bad.any() or stamps.shape[-1] < 2:
+        return ""
+    index = [int(i) for i in np.argwhere(bad)[0]]
+    series, row = stamps[tuple(index[:-1])], index[-1]
+    usual = float(np.median(np.diff(np.unique(series)).astype(float))) if np.ptp(series) else 0.0
+    last = "" if not row else f"{series[row] - series[row - 1]:.6g} s after the row before, "
+    return f" ({last}the median interval is {usual:.6g} s)"
+
+
+def _number(first: np.ndarray) -> str:
+    return f"t0 = {float(first):.10g}" if first.ndim == 0 else "the first time"

@@ -1,0 +1,66 @@
+"""Matrices that differ from sensor to sensor: what a table of them must be, and one looked up."""
+
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from ewif_jax import checks
+from ewif_jax.fast.compiling import array
+from ewif_jax.fast.small import matvec
+from ewif_jax.fast.sparse import Pattern, pattern
+from ewif_jax.models.parameters import named, of_params
+
+
+def by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
+    """A function of (params, sensor, t), and how many sensors it knows of: S of a table, 0 for a
+    matrix that all sensors share, None for a function."""
+    if isinstance(x, Tracer):
+        return partial(_looked_up, argument, lambda params: x), None
+    if callable(x):
+        return (partial(_looked_up, argument, named(x)) if of_params(x) else named(x)), None
+    table = array(x)
+    checks.finite(argument, x)
+    checks.require(
+        table.ndim in (2, 3), argument, "a function, a matrix or a table (S, ., .)", table.shape
+    )
+    if argument == "R":
+        for k, matrix in enumerate(np.asarray(x) if table.ndim == 3 else [x]):
+            checks.psd("R" if table.ndim == 2 else f"R[{k}]", matrix)
+    if table.ndim == 2:
+        return (lambda params, sensor, t: table), 0
+    return (lambda params, sensor, t: select(table, sensor)), table.shape[0]
+
+
+def _looked_up(argument: str, x: Any, params: Any, sensor: Array, t: Array) -> Array:
+    """The matrix of a sensor in what `params` give: a matrix, or a table of them."""
+    del t
+    table = jnp.asarray(x(params))
+    checks.require(
+        table.ndim in (2, 3), argument, "a matrix or a table (S, ., .) from params", table.shape
+    )
+    return table if table.ndim == 2 else table[sensor]
+
+
+def count_sensors(rows: int | None, cols: int | None) -> int | None:
+    """How many sensors H and R speak of together; one matrix each is one sensor."""
+    tables = [count for count in (rows, cols) if count]
+    checks.require(
+        len(set(tables)) < 2, "R", f"as many sensors as H has ({rows})", f"{cols} sensors"
+    )
+    return tables[0] if tables else 1 if rows == cols == 0 else None
+
+
+def pattern_of_table(H: Any) -> Pattern | None:
+    """Where a constant matrix, or any of a table, may differ from zero."""
+    known = None if callable(H) else checks.known(H)
+    return None if known is None else pattern(*known.reshape(-1, *known.shape[-2:]))
+
+
+def select(table: Array, index: Array) -> Array:
+    """table[index] for a small table, as a product (a gather is slow in a batch)."""
+    chosen = (jnp.arange(table.shape[0]) == index).astype(table.dtype)
+    return matvec(table.reshape(table.shape[0], -1).T, chosen).reshape(table.shape[1:])

@@ -1,0 +1,1 @@
+"""Published experiments, one folder each: study.py runs it, runs.py and figures.py serve it."""

@@ -1,0 +1,1 @@
+"""Orguner & Gustafsson, section IV: particle filters, a fast turn, and a late third sensor."""

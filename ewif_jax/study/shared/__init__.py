@@ -1,0 +1,1 @@
+"""What several studies use: results, claims, timing, sweeps, the look of figures."""

@@ -1,0 +1,219 @@
+"""`ewif-jax track`: a filter over the measurements in a CSV file, before and after tuning."""
+
+import hashlib
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import optax
+import pandas as pd
+import xarray as xr
+
+from ewif_jax.fast.compiling import array
+from ewif_jax.study.shared.experiment import Experiment, Options, Refused
+from ewif_jax.study.track import figures as track_figures
+from ewif_jax.study.track.loss import filtered, loss, report
+from ewif_jax.study.track.method import Method, method
+from ewif_jax.study.track.readings import Readings, read
+from ewif_jax.study.track.tracks import Tracks, batch, degrees
+from ewif_jax.tuning import tune
+from ewif_jax.types import Measurement, Status
+
+AXES = "xyz"
+LABEL = {
+    "median": "median prediction error (smooth) [m]",
+    "robust": "mean prediction error [m]",
+    "squared": "root mean square prediction error [m]",
+    "likelihood": "mean negative log likelihood",
+}
+
+
+class Outcome(NamedTuple):
+    """One kind of time stamps: what the filter found with the parameter before and after tuning
+    (the same without), and the tuning history."""
+
+    stamps: str
+    before: dict[str, np.ndarray]
+    after: dict[str, np.ndarray]
+    value: tuple[float, float]
+    history: dict[str, Any] | None
+
+
+def track(arguments: Any, options: Options) -> None:
+    """Reads, filters, tunes if asked to, and reports."""
+    columns = {
+        name: getattr(arguments, name)
+        for name in ("time", "arrival", "track", "sensor", "values", "latlon")
+    }
+    readings = read(arguments.file, **columns)
+    tracks = batch(readings, min_points=arguments.min_points, drop_stale=arguments.drop_stale)
+    if tracks.measurements.value.shape[-1] > len(AXES):
+        raise Refused(f"--values: expected at most {len(AXES)} columns")
+    counted = tracks.present & (np.arange(tracks.present.shape[1]) >= arguments.warm_up)
+    if not counted.any():
+        raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to score")
+    chosen = method(arguments, tracks)
+    with Experiment("track", options, _settings(arguments)) as experiment:
+        _followed(experiment, arguments, readings, tracks, counted, chosen)
+
+
+def _followed(experiment, arguments, readings, tracks, counted, chosen):
+    _introduce(experiment, readings, tracks)
+    stamped = {"validity": tracks.measurements}
+    if readings.columns.arrival is not None:
+        stamped["report"] = tracks.measurements._replace(time=tracks.arrival)
+    outcomes = [
+        _outcome(experiment, arguments, chosen, stamps, measurements, counted)
+        for stamps, measurements in stamped.items()
+    ]
+    _save(experiment, readings, tracks, outcomes)
+    experiment.figure("tracks", track_figures.tracks(tracks, outcomes[0].after))
+    experiment.figure("innovations", track_figures.innovations(tracks, outcomes[0], counted))
+    if arguments.tune:
+        drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
+        experiment.figure("tuning", drawn)
+    rows = [
+        row
+        for outcome in outcomes
+        for row in _rows(outcome, chosen, counted, experiment.options.seed)
+    ]
+    title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
+    experiment.table("track", title, rows, [_statuses(tracks, outcomes[0])])
+    experiment.finish()
+
+
+def _outcome(
+    experiment: Experiment,
+    arguments: Any,
+    chosen: Method,
+    stamps: str,
+    measurements: Measurement,
+    counted: np.ndarray,
+) -> Outcome:
+    measurements = jax.tree.map(array, measurements)
+    with experiment.timed("filtering"):
+        before = after = filtered(chosen, chosen.params, measurements)
+    start = chosen.params[chosen.name]
+    if not arguments.tune:
+        return Outcome(stamps, before, after, (float(start), float(start)), None)
+    label = f"tuning {chosen.name} ({stamps} times)"
+    with experiment.timed(label), experiment.progress(label) as progress:
+        tuned = tune(
+            loss(arguments.loss, chosen, measurements, counted),
+            {chosen.name: start},
+            steps=arguments.steps,
+            optimizer=_optimizer(arguments.steps),
+            transforms=chosen.transform,
+            progress=progress,
+        )
+    with experiment.timed("filtering"):
+        after = filtered(chosen, {**chosen.params, **tuned.params}, measurements)
+    value = float(start), float(tuned.params[chosen.name])
+    return Outcome(stamps, before, after, value, tuned.history)
+
+
+def _optimizer(steps: int) -> optax.GradientTransformation:
+    """Adam with a short memory: the loss can fall tenfold on the way, and steps that remember the
+    first gradients (b2 = 0.999) would stop short of the optimum."""
+    return optax.adam(optax.cosine_decay_schedule(0.1, steps), b2=0.9)
+
+
+def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:
+    time, arrival, track, sensor, values, geographic = readings.columns
+    roles = {"time": time, "arrival": arrival, "track": track, "sensor": sensor}
+    named = [f"{role} {name}" for role, name in roles.items() if name is not None]
+    named.append(f"{'lat, lon' if geographic else 'values'} {', '.join(values)}")
+    experiment.say(f"Columns: {'; '.join(named)}.")
+    left = "".join(f"; dropped {count} rows {why}" for why, count in tracks.dropped.items())
+    experiment.say(
+        f"{len(readings.time)} rows: {tracks.present.sum()} measurements of "
+        f"{len(tracks.name)} tracks{left}."
+    )
+
+
+def _rows(outcome: Outcome, chosen: Method, counted: np.ndarray, seed: int) -> list[dict[str, Any]]:
+    pairs = [("given" if outcome.history is None else "before", outcome.value[0], outcome.before)]
+    if outcome.history is not None:
+        pairs.append(("tuned", outcome.value[1], outcome.after))
+    return [
+        {
+            "times": outcome.stamps,
+            "setting": setting,
+            f"{chosen.name} [{chosen.unit}]": value,
+            **report(found, counted, seed),
+        }
+        for setting, value, found in pairs
+    ]
+
+
+def _statuses(tracks: Tracks, outcome: Outcome) -> str:
+    status = outcome.after["status"][tracks.present]
+    counts = [(kind.name.lower().replace("_", " "), (status == kind).sum()) for kind in Status]
+    return "Measurements: " + ", ".join(f"{count} {kind}" for kind, count in counts if count)
+
+
+def _save(
+    experiment: Experiment, readings: Readings, tracks: Tracks, outcomes: list[Outcome]
+) -> None:
+    """estimates.csv and track.nc: what the filter says after each measurement."""
+    found, shown = outcomes[0].after, tracks.present
+    row = np.nonzero(shown)[0]
+    states = state_names(found["mean"].shape[-1], tracks.measurements.value.shape[-1])
+    frame = {
+        "track": tracks.name[row],
+        "line": tracks.line[shown],
+        "time": tracks.measurements.time[shown] + tracks.start[row],
+        "arrival": tracks.arrival[shown] + tracks.start[row],
+    }
+    frame |= dict(zip(states, found["mean"][shown].T, strict=True))
+    frame |= {f"sd_{n}": x for n, x in zip(states, found["sd"][shown].T, strict=True)}
+    if tracks.origin is not None:
+        place = np.concatenate(
+            [
+                degrees(o, m[p, :2])
+                for o, m, p in zip(tracks.origin, found["mean"], shown, strict=True)
+            ]
+        )
+        frame |= dict(zip(readings.columns.values, place.T, strict=True))
+    frame |= {
+        "prediction_error": found["error"][shown],
+        "nis_per_component": found["nis"][shown],
+        "status": [Status(s).name.lower() for s in found["status"][shown]],
+    }
+    experiment.csv("estimates", pd.DataFrame(frame))
+    dims = ("stamps", "setting", "track", "row")
+    both = {
+        name: np.stack([np.stack([o.before[name], o.after[name]]) for o in outcomes])
+        for name in found
+    }
+    arrays = {
+        "time": (dims[2:], tracks.measurements.time, {"units": "s", "long_name": "since start"}),
+        "arrival": (dims[2:], tracks.arrival, {"units": "s", "long_name": "since start"}),
+        "start": ("track", tracks.start, {"units": "s"}),
+        "present": (dims[2:], tracks.present),
+        "value": ((*dims[2:], "axis"), tracks.measurements.value, {"units": "m"}),
+        "mean": ((*dims, "state"), both["mean"], {"units": "m, m/s, m/s^2"}),
+        "sd": ((*dims, "state"), both["sd"], {"units": "m, m/s, m/s^2"}),
+        "innovation": ((*dims, "axis"), both["innovation"], {"units": "m"}),
+        "nis_per_component": (dims, both["nis"], {"units": "1"}),
+        "status": (dims, both["status"], {"meaning": str({s.name: s.value for s in Status})}),
+    }
+    coords = {
+        "stamps": [outcome.stamps for outcome in outcomes],
+        "setting": ["before", "after"],
+        "track": tracks.name,
+        "state": states,
+    }
+    experiment.arrays("track", xr.Dataset(arrays, coords))
+
+
+def state_names(n: int, dims: int) -> list[str]:
+    """x, y, vx, vy, ...: the names of the state's components."""
+    return [prefix + axis for prefix in ("", "v", "a")[: n // dims] for axis in AXES[:dims]]
+
+
+def _settings(arguments: Any) -> dict[str, Any]:
+    left_out = ("action", "out", "overwrite", "runs", "quick", "chunk", "dtype", "seed")
+    given = {k: str(v) for k, v in vars(arguments).items() if k not in left_out}
+    digest = hashlib.sha256(arguments.file.read_bytes()).hexdigest()[:12]
+    return {**given, "file_digest": digest}

@@ -1,0 +1,125 @@
+"""How well measurements are predicted from the earlier ones: losses for tuning, and a report."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ewif_jax import scores
+from ewif_jax.analysis.consistency import nis
+from ewif_jax.batch import Step, run_batch
+from ewif_jax.charges import Cost, density_cost, length_cost, squared_cost
+from ewif_jax.losses import value_charging
+from ewif_jax.scores import average
+from ewif_jax.study.shared.experiment import Measured
+from ewif_jax.study.track.method import Method
+from ewif_jax.types import Measurement, Status
+
+WIDTH = 0.1
+"""Of the smooth median, in units of the logarithm of the error."""
+
+
+def smooth_median(length: Array) -> Array:
+    r"""A differentiable median of positive numbers; NaN are left out.
+
+    The m with :math:`\sum_i \sigma((\log m - \log x_i) / w) = N / 2`, w = `WIDTH`: the median for
+    w -> 0. Its gradient is the average of the gradients of the x_i near m, so what the worst
+    predictions do does not matter.
+    """
+    known = jnp.isfinite(length)
+    logs = jnp.log(jnp.where(known, length, 1) + jnp.finfo(length.dtype).tiny)
+    fixed = lax.stop_gradient(logs)
+    count = jnp.maximum(jnp.sum(known), 1)
+
+    def below(m: Array, logs: Array) -> Array:
+        return jnp.sum(jnp.where(known, jax.nn.sigmoid((m - logs) / WIDTH), 0)) / count
+
+    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = (bounds[0] + bounds[1]) / 2
+        low = below(middle, fixed) < 0.5
+        return jnp.where(low, middle, bounds[0]), jnp.where(low, bounds[1], middle)
+
+    ends = (
+        jnp.min(fixed, where=known, initial=jnp.inf),
+        jnp.max(fixed, where=known, initial=-jnp.inf),
+    )
+    low, high = lax.fori_loop(0, 60, halve, ends)
+    m = (low + high) / 2
+    slope = jax.grad(below)(m, fixed)
+    # one Newton step that does not move m, through which the implicit derivative flows
+    return jnp.exp(m - (below(m, logs) - below(m, fixed)) / slope)
+
+
+LOSSES: dict[str, tuple[scores.Score, Cost, Callable[[Array], Array]]] = {
+    "median": (scores.robust_innovation, length_cost, smooth_median),
+    "robust": (scores.robust_innovation, length_cost, average),
+    "squared": (scores.squared_innovation, squared_cost, lambda x: jnp.sqrt(average(x))),
+    "likelihood": (scores.negative_log_likelihood, density_cost, average),
+}
+
+
+def loss(
+    kind: str, method: Method, measurements: Measurement, counted: np.ndarray
+) -> Callable[[Any], Array]:
+    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T); those
+    that the filter does not predict are charged."""
+    score, cost, finish = LOSSES[kind]
+    setting = {"prior": method.prior, "t0": 0.0}
+    charging = value_charging(method.estimator, measurements, cost, "charge", setting)
+
+    def tracked(params: Any) -> Array:
+        values = charging.scored({**method.params, **params}, None, score)
+        return finish(jnp.where(counted, values, jnp.nan))
+
+    return tracked
+
+
+def filtered(method: Method, params: Any, measurements: Measurement) -> dict[str, np.ndarray]:
+    """Estimates and diagnostics (R, T, ...) of all tracks, in one batched call."""
+    found = run_batch(
+        method.estimator, params, measurements, prior=method.prior, t0=0.0, observe=_seen, devices=1
+    )
+    arrays = {name: np.asarray(x) for name, x in found.items()}
+    components = np.maximum(np.sum(measurements.mask, -1), 1)
+    return {**arrays, "nis": arrays["nis"] / components}
+
+
+def report(found: dict[str, np.ndarray], counted: np.ndarray, seed: int) -> dict[str, Any]:
+    """Median and RMSE of the one-step prediction errors in metres, and NIS per component, with
+    standard errors by resampling tracks."""
+    used = counted & (found["status"] <= Status.LATE_USED) & np.isfinite(found["error"])
+    errors = [row[use] for row, use in zip(found["error"], used, strict=True)]
+    nis_of = [row[use] for row, use in zip(found["nis"], used, strict=True)]
+    return {
+        "median error [m]": _resampled(errors, np.median, seed),
+        "RMSE [m]": _resampled(errors, lambda x: np.sqrt(np.mean(x**2)), seed),
+        "NIS per component": _resampled(nis_of, np.mean, seed),
+        "scored": int(used.sum()),
+    }
+
+
+def _seen(step: Step, _: None) -> dict[str, Array]:
+    info = step.info
+    return {
+        "mean": step.mean,
+        "sd": jnp.sqrt(jnp.diagonal(step.cov)),
+        "innovation": info.innovation,
+        "error": jnp.sqrt(jnp.sum(jnp.square(info.innovation))),
+        "nis": nis(info),
+        "status": info.status,
+    }
+
+
+def _resampled(groups: list[np.ndarray], statistic: Callable[[Any], Any], seed: int) -> Measured:
+    groups = [group for group in groups if group.size]
+    if not groups:
+        return Measured(np.nan, np.nan)
+    value = float(statistic(np.concatenate(groups)))
+    if len(groups) == 1:
+        return Measured(value, np.nan)
+    draws = np.random.default_rng(seed).integers(len(groups), size=(200, len(groups)))
+    again = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
+    return Measured(value, float(np.std(again, ddof=1)))

@@ -1,0 +1,101 @@
+"""The filter that `ewif-jax track` runs: model, estimator, parameters and a start that knows
+nothing."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ewif_jax import models
+from ewif_jax.estimators.ewif import ewif
+from ewif_jax.estimators.fading import fading
+from ewif_jax.estimators.information import information
+from ewif_jax.estimators.kalman import kalman
+from ewif_jax.estimators.square_root import square_root
+from ewif_jax.oosm.al1 import al1
+from ewif_jax.oosm.asd import asd
+from ewif_jax.study.shared.experiment import Refused
+from ewif_jax.study.track.tracks import Tracks
+from ewif_jax.transforms import Transform, positive
+from ewif_jax.types import Estimator, Gaussian
+
+MODELS = {
+    "random-walk": models.random_walk,
+    "constant-velocity": models.constant_velocity,
+    "constant-acceleration": models.constant_acceleration,
+}
+BUILDERS = {
+    "ewif": lambda model, lag: ewif(model, tau=lambda p: p["tau"]),
+    "kalman": lambda model, lag: kalman(model),
+    "information": lambda model, lag: information(model),
+    "square-root": lambda model, lag: square_root(model),
+    "fading": lambda model, lag: fading(model, lambda p: p["fading"]),
+    "al1": al1,
+    "asd": asd,
+}
+UNKNOWN = 1e3
+"""Standard deviations at the start, in units of what one interval of measurements tells."""
+
+
+class Method(NamedTuple):
+    """estimator and params; name, unit and transform of the parameter that can be tuned; prior."""
+
+    estimator: Estimator
+    params: dict[str, Any]
+    name: str
+    unit: str
+    transform: Transform
+    prior: Gaussian | None
+
+
+def method(arguments: Any, tracks: Tracks) -> Method:
+    """The filter that the arguments ask for.
+
+    What is not given follows from the noise s and the median interval dt of the measurements:
+    tau = 5 dt, and q such that the model's noise over one interval is about as large as s.
+    """
+    order = list(MODELS).index(arguments.model)
+    dims = tracks.measurements.value.shape[-1]
+    noise, interval = _noise(arguments.noise, tracks.sensors), _interval(tracks)
+    sensors = [models.position_sensor(s**2, dims) for s in noise]
+    model = MODELS[arguments.model](sensors=sensors, q=lambda p: p["q"], dims=dims)
+    estimator = BUILDERS[arguments.estimator](model, arguments.lag)
+    prior = None
+    if arguments.estimator not in ("ewif", "information"):
+        spread = UNKNOWN * max(noise) / interval ** np.arange(order + 1)
+        mean = np.zeros((len(tracks.name), (order + 1) * dims))
+        mean[:, :dims] = tracks.measurements.value[:, 0]
+        prior = Gaussian(jnp.asarray(mean), jnp.diag(jnp.repeat(jnp.asarray(spread**2), dims)))
+    q = arguments.q or max(noise) ** 2 / interval ** (2 * order + 1)
+    if arguments.estimator == "ewif":
+        name, unit, value, transform = "tau", "s", arguments.tau or 5 * interval, positive()
+    elif arguments.estimator == "fading":
+        name, unit, value, transform = "fading", "1", arguments.fading or 1.2, _above_one()
+        q = arguments.q or 0.0
+    else:
+        name, unit, value, transform = "q", f"m^2/s^{2 * order + 1}", q, positive()
+    params = {"q": q, name: value}
+    used = params if arguments.estimator != "ewif" else {name: value}
+    params = {key: jnp.asarray(np.asarray(x, float)) for key, x in used.items()}
+    return Method(estimator, params, name, unit, transform, prior)
+
+
+def _noise(given: dict[str, float], sensors: list[str]) -> list[float]:
+    if "" in given:
+        return [given[""]] * len(sensors)
+    missing = [name for name in sensors if name not in given]
+    if missing:
+        raise Refused(f"--noise: says nothing of sensor {', '.join(map(repr, missing))}")
+    return [given[name] for name in sensors]
+
+
+def _interval(tracks: Tracks) -> float:
+    """The median time between measurements of a track, in seconds."""
+    time = np.where(tracks.present, tracks.measurements.time, np.nan)
+    steps = np.diff(np.sort(time, axis=1), axis=1)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else 1.0
+
+
+def _above_one() -> Transform:
+    return Transform(lambda raw: 1 + jnp.exp(raw), lambda value: jnp.log(value - 1))

@@ -1,0 +1,6 @@
+"""Parameters from data: `tune`, and the value and gradient it goes by."""
+
+from ewif_jax.tuning.gradient_descent import Tuned, tune
+from ewif_jax.tuning.value_gradient import value_and_gradient
+
+__all__ = ["Tuned", "tune", "value_and_gradient"]
