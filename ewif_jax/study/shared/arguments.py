@@ -27,7 +27,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _common(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("common options")
-    group.add_argument("--seed", type=int, default=0, help="of the random numbers (0)")
+    group.add_argument("--seed", type=seed, default=0, help="of the random numbers (0)")
     group.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
     group.add_argument(
         "--overwrite", action="store_true", help="replace earlier results instead of keeping them"
@@ -53,7 +53,9 @@ def _track(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(runs=None, quick=False, chunk=None)
     parser.add_argument("file", type=Path, metavar="FILE.csv")
-    columns = parser.add_argument_group("columns (guessed from common names where not given)")
+    columns = parser.add_argument_group(
+        "columns (guessed where not given; none: there is no such column)"
+    )
     columns.add_argument("--time", metavar="COL", help="when the value was true, seconds")
     columns.add_argument(
         "--arrival", metavar="COL", help="when it arrived or was reported, seconds"
@@ -63,6 +65,11 @@ def _track(parser: argparse.ArgumentParser) -> None:
     where = columns.add_mutually_exclusive_group()
     where.add_argument("--values", metavar="X,Y", type=names, help="position, in metres")
     where.add_argument("--latlon", metavar="LAT,LON", type=names, help="position, in degrees")
+    columns.add_argument("--date", metavar="COL", help="of the days, where --time has times of day")
+    columns.add_argument("--decimal", choices=(".", ","), help="mark of decimals (what it shows)")
+    columns.add_argument(
+        "--dates", choices=("day-first", "month-first"), help="03/04/2024 (what the file shows)"
+    )
     columns.add_argument(
         "--drop-stale", action="store_true", help="drop rows that repeat the last value of a track"
     )
@@ -128,6 +135,14 @@ def above(bound: float) -> Callable[[str], float]:
 
 
 positive = above(0)
+
+
+def seed(text: str) -> int:
+    """Reads a seed: what every generator of random numbers takes."""
+    number = whole(0)(text)
+    if number >= 2**32:
+        raise argparse.ArgumentTypeError(f"expected a whole number below 2**32, got {text!r}")
+    return number
 
 
 def names(text: str) -> list[str]:

@@ -10,7 +10,8 @@ import pandas as pd
 import xarray as xr
 
 from ewif_jax.fast.compiling import array
-from ewif_jax.study.shared.experiment import Experiment, Options, Refused
+from ewif_jax.study.shared.experiment import Experiment, Options
+from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track import figures as track_figures
 from ewif_jax.study.track.loss import filtered, loss, report
 from ewif_jax.study.track.method import Method, method
@@ -20,6 +21,8 @@ from ewif_jax.tuning import tune
 from ewif_jax.types import Measurement, Status
 
 AXES = "xyz"
+READING = ("time", "date", "arrival", "track", "sensor", "values", "latlon", "decimal", "dates")
+"""the options that say how to read the file"""
 LABEL = {
     "median": "median prediction error (smooth) [m]",
     "robust": "mean prediction error [m]",
@@ -41,30 +44,34 @@ class Outcome(NamedTuple):
 
 def track(arguments: Any, options: Options) -> None:
     """Reads, filters, tunes if asked to, and reports."""
-    columns = {
-        name: getattr(arguments, name)
-        for name in ("time", "arrival", "track", "sensor", "values", "latlon")
-    }
-    readings = read(arguments.file, **columns)
+    given = {name: getattr(arguments, name) for name in READING}
+    readings = read(arguments.file, **given)
     tracks = batch(readings, min_points=arguments.min_points, drop_stale=arguments.drop_stale)
-    if tracks.measurements.value.shape[-1] > len(AXES):
+    if tracks.value.shape[-1] > len(AXES):
         raise Refused(f"--values: expected at most {len(AXES)} columns")
-    counted = tracks.present & (np.arange(tracks.present.shape[1]) >= arguments.warm_up)
-    if not counted.any():
-        raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to score")
+    counted = tracks.rank() >= arguments.warm_up
+    if arguments.tune and not counted.any():
+        raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to tune by")
     chosen = method(arguments, tracks)
     with Experiment("track", options, _settings(arguments)) as experiment:
         _followed(experiment, arguments, readings, tracks, counted, chosen)
 
 
-def _followed(experiment, arguments, readings, tracks, counted, chosen):
+def _followed(
+    experiment: Experiment,
+    arguments: Any,
+    readings: Readings,
+    tracks: Tracks,
+    counted: np.ndarray,
+    chosen: Method,
+) -> None:
     _introduce(experiment, readings, tracks)
-    stamped = {"validity": tracks.measurements}
+    stamped = {"validity": [group.measurements for group in tracks.groups]}
     if readings.columns.arrival is not None:
-        stamped["report"] = tracks.measurements._replace(time=tracks.arrival)
+        stamped["report"] = [g.measurements._replace(time=g.arrival) for g in tracks.groups]
     outcomes = [
-        _outcome(experiment, arguments, chosen, stamps, measurements, counted)
-        for stamps, measurements in stamped.items()
+        _outcome(experiment, arguments, chosen, stamps, tracks, streams, counted)
+        for stamps, streams in stamped.items()
     ]
     _save(experiment, readings, tracks, outcomes)
     experiment.figure("tracks", track_figures.tracks(tracks, outcomes[0].after))
@@ -72,13 +79,13 @@ def _followed(experiment, arguments, readings, tracks, counted, chosen):
     if arguments.tune:
         drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
         experiment.figure("tuning", drawn)
-    rows = [
-        row
-        for outcome in outcomes
-        for row in _rows(outcome, chosen, counted, experiment.options.seed)
-    ]
+    seed = arguments.seed
+    rows = [row for o in outcomes for row in _rows(o, chosen, tracks.row, counted, seed)]
     title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
-    experiment.table("track", title, rows, [_statuses(tracks, outcomes[0])])
+    notes = [_statuses(outcomes[0])]
+    if not counted.any():
+        notes.append(f"--warm-up: {arguments.warm_up} leaves no measurement to score.")
+    experiment.table("track", title, rows, notes)
     experiment.finish()
 
 
@@ -87,19 +94,23 @@ def _outcome(
     arguments: Any,
     chosen: Method,
     stamps: str,
-    measurements: Measurement,
+    tracks: Tracks,
+    streams: list[Measurement],
     counted: np.ndarray,
 ) -> Outcome:
-    measurements = jax.tree.map(array, measurements)
+    batches = [
+        (group.tracks, jax.tree.map(array, stream))
+        for group, stream in zip(tracks.groups, streams, strict=True)
+    ]
     with experiment.timed("filtering"):
-        before = after = filtered(chosen, chosen.params, measurements)
+        before = after = filtered(chosen, chosen.params, tracks, batches)
     start = chosen.params[chosen.name]
     if not arguments.tune:
         return Outcome(stamps, before, after, (float(start), float(start)), None)
     label = f"tuning {chosen.name} ({stamps} times)"
     with experiment.timed(label), experiment.progress(label) as progress:
         tuned = tune(
-            loss(arguments.loss, chosen, measurements, counted),
+            loss(arguments.loss, chosen, batches, tracks.grouped(counted, False)),
             {chosen.name: start},
             steps=arguments.steps,
             optimizer=_optimizer(arguments.steps),
@@ -107,7 +118,7 @@ def _outcome(
             progress=progress,
         )
     with experiment.timed("filtering"):
-        after = filtered(chosen, {**chosen.params, **tuned.params}, measurements)
+        after = filtered(chosen, {**chosen.params, **tuned.params}, tracks, batches)
     value = float(start), float(tuned.params[chosen.name])
     return Outcome(stamps, before, after, value, tuned.history)
 
@@ -119,19 +130,17 @@ def _optimizer(steps: int) -> optax.GradientTransformation:
 
 
 def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:
-    time, arrival, track, sensor, values, geographic = readings.columns
-    roles = {"time": time, "arrival": arrival, "track": track, "sensor": sensor}
-    named = [f"{role} {name}" for role, name in roles.items() if name is not None]
-    named.append(f"{'lat, lon' if geographic else 'values'} {', '.join(values)}")
-    experiment.say(f"Columns: {'; '.join(named)}.")
-    left = "".join(f"; dropped {count} rows {why}" for why, count in tracks.dropped.items())
+    experiment.say(" ".join([str(readings.columns), *readings.notes]))
+    left = "".join(f"; {count} {why}" for why, count in tracks.dropped.items())
     experiment.say(
-        f"{len(readings.time)} rows: {tracks.present.sum()} measurements of "
-        f"{len(tracks.name)} tracks{left}."
+        f"{len(readings.time)} rows: {len(tracks.row)} measurements of {len(tracks.name)} tracks"
+        f"{left and '. Left out or missing: ' + left[2:]}."
     )
 
 
-def _rows(outcome: Outcome, chosen: Method, counted: np.ndarray, seed: int) -> list[dict[str, Any]]:
+def _rows(
+    outcome: Outcome, chosen: Method, row: np.ndarray, counted: np.ndarray, seed: int
+) -> list[dict[str, Any]]:
     pairs = [("given" if outcome.history is None else "before", outcome.value[0], outcome.before)]
     if outcome.history is not None:
         pairs.append(("tuned", outcome.value[1], outcome.after))
@@ -140,14 +149,14 @@ def _rows(outcome: Outcome, chosen: Method, counted: np.ndarray, seed: int) -> l
             "times": outcome.stamps,
             "setting": setting,
             f"{chosen.name} [{chosen.unit}]": value,
-            **report(found, counted, seed),
+            **report(found, row, counted, seed),
         }
         for setting, value, found in pairs
     ]
 
 
-def _statuses(tracks: Tracks, outcome: Outcome) -> str:
-    status = outcome.after["status"][tracks.present]
+def _statuses(outcome: Outcome) -> str:
+    status = outcome.after["status"]
     counts = [(kind.name.lower().replace("_", " "), (status == kind).sum()) for kind in Status]
     return "Measurements: " + ", ".join(f"{count} {kind}" for kind, count in counts if count)
 
@@ -155,43 +164,45 @@ def _statuses(tracks: Tracks, outcome: Outcome) -> str:
 def _save(
     experiment: Experiment, readings: Readings, tracks: Tracks, outcomes: list[Outcome]
 ) -> None:
-    """estimates.csv and track.nc: what the filter says after each measurement."""
-    found, shown = outcomes[0].after, tracks.present
-    row = np.nonzero(shown)[0]
-    states = state_names(found["mean"].shape[-1], tracks.measurements.value.shape[-1])
+    """estimates.csv and track.nc: what the filter says after each measurement, of the time
+    `estimate_time`."""
+    found, row = outcomes[0].after, tracks.row
+    states = state_names(found["mean"].shape[-1], tracks.value.shape[-1])
+    # a late row leaves the state at the newest time so far
+    newest = pd.Series(tracks.time).groupby(row).cummax().to_numpy()
     frame = {
         "track": tracks.name[row],
-        "line": tracks.line[shown],
-        "time": tracks.measurements.time[shown] + tracks.start[row],
-        "arrival": tracks.arrival[shown] + tracks.start[row],
+        "line": tracks.line,
+        "time": tracks.time + tracks.start[row],
+        "arrival": tracks.arrival + tracks.start[row],
+        "estimate_time": newest + tracks.start[row],
     }
-    frame |= dict(zip(states, found["mean"][shown].T, strict=True))
-    frame |= {f"sd_{n}": x for n, x in zip(states, found["sd"][shown].T, strict=True)}
+    frame |= dict(zip(states, found["mean"].T, strict=True))
+    frame |= {f"sd_{n}": x for n, x in zip(states, found["sd"].T, strict=True)}
     if tracks.origin is not None:
-        place = np.concatenate(
-            [
-                degrees(o, m[p, :2])
-                for o, m, p in zip(tracks.origin, found["mean"], shown, strict=True)
-            ]
-        )
-        frame |= dict(zip(readings.columns.values, place.T, strict=True))
+        cuts = np.searchsorted(row, np.arange(1, len(tracks.name)))
+        means = np.split(found["mean"][:, :2], cuts)
+        place = [degrees(o, m) for o, m in zip(tracks.origin, means, strict=True)]
+        frame |= dict(zip(readings.columns.values, np.concatenate(place).T, strict=True))
     frame |= {
-        "prediction_error": found["error"][shown],
-        "nis_per_component": found["nis"][shown],
-        "status": [Status(s).name.lower() for s in found["status"][shown]],
+        "prediction_error": found["error"],
+        "nis_per_component": found["nis"],
+        "status": [Status(s).name.lower() for s in found["status"]],
     }
     experiment.csv("estimates", pd.DataFrame(frame))
-    dims = ("stamps", "setting", "track", "row")
+    dims = ("stamps", "setting", "row")
     both = {
         name: np.stack([np.stack([o.before[name], o.after[name]]) for o in outcomes])
         for name in found
     }
+    since = {"units": "s", "long_name": "since start"}
     arrays = {
-        "time": (dims[2:], tracks.measurements.time, {"units": "s", "long_name": "since start"}),
-        "arrival": (dims[2:], tracks.arrival, {"units": "s", "long_name": "since start"}),
+        "track_of_row": ("row", row, {"instance_dimension": "track"}),
+        "time": ("row", tracks.time, since),
+        "arrival": ("row", tracks.arrival, since),
+        "estimate_time": ("row", newest, since),
         "start": ("track", tracks.start, {"units": "s"}),
-        "present": (dims[2:], tracks.present),
-        "value": ((*dims[2:], "axis"), tracks.measurements.value, {"units": "m"}),
+        "value": (("row", "axis"), tracks.value, {"units": "m"}),
         "mean": ((*dims, "state"), both["mean"], {"units": "m, m/s, m/s^2"}),
         "sd": ((*dims, "state"), both["sd"], {"units": "m, m/s, m/s^2"}),
         "innovation": ((*dims, "axis"), both["innovation"], {"units": "m"}),

@@ -25,15 +25,15 @@ MOST = 200
 def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
     """All tracks, and the longest one with its measurements and two standard deviations."""
     figure, (left, right) = canvas(1, 2, width=11, height=4.8)
-    longest = int(np.argmax(found.present.sum(1)))
+    longest = int(np.argmax(np.bincount(found.row)))
     for row in range(min(len(found.name), MOST)):
-        place = _place(found, row, estimate["mean"][row])
+        place = _place(found, row, estimate["mean"])
         focus = row == longest
         left.plot(*place, color=KALMAN if focus else OTHER, linewidth=1.6 if focus else 0.7)
     name = found.name[longest]
     several = f"{len(found.name)} tracks; {name} highlighted"
     many = several if len(found.name) > 1 else "estimated track"
-    dims = found.measurements.value.shape[-1]
+    dims = found.value.shape[-1]
     if found.origin is not None:
         latitude = np.deg2rad(found.origin[:, 0].mean())
         left.set_aspect(1 / np.cos(latitude))
@@ -50,7 +50,7 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
 def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
     """Prediction error and NIS of every scored measurement over time."""
     figure, (above, below) = canvas(2, 1, width=10, height=6.5, sharex=True)
-    time = np.asarray(found.measurements.time)
+    time = found.time
     runs = [("", outcome.after, EWIF, "-")]
     if outcome.history is not None:
         runs = [(", before tuning", outcome.before, KALMAN, "--"), (", tuned", *runs[0][1:])]
@@ -93,21 +93,20 @@ def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
 
 
 def _place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    here = found.present[row]
+    here = found.row == row
     if found.origin is not None:
         where = degrees(found.origin[row], mean[here, :2])
         return where[:, 1], where[:, 0]
-    if found.measurements.value.shape[-1] == 1:
-        return np.asarray(found.measurements.time)[row, here], mean[here, 0]
+    if found.value.shape[-1] == 1:
+        return found.time[here], mean[here, 0]
     return mean[here, 0], mean[here, 1]
 
 
 def _zoom(axes: Any, found: Tracks, estimate: dict[str, np.ndarray], row: int) -> None:
     """Each axis of one track against time, less a straight line."""
-    here = found.present[row]
-    time, value = found.measurements.time[row, here], found.measurements.value[row, here]
-    mean, sd = estimate["mean"][row, here], estimate["sd"][row, here]
-    seen = found.measurements.mask[row, here]
+    here = found.row == row
+    time, value, seen = found.time[here], found.value[here], found.mask[here]
+    mean, sd = estimate["mean"][here], estimate["sd"][here]
     for axis, color in zip(range(value.shape[1]), (EWIF, KALMAN, OTHER), strict=False):
         use = seen[:, axis]
         line = np.polyval(np.polyfit(time[use], value[use, axis], min(1, use.sum() - 1)), time)

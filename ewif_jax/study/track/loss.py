@@ -1,6 +1,6 @@
 """How well measurements are predicted from the earlier ones: losses for tuning, and a report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from ewif_jax.charging import value_charging
 from ewif_jax.scores import average
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.track.method import Method
+from ewif_jax.study.track.tracks import Tracks
 from ewif_jax.types import Measurement, Status
 
 WIDTH = 0.1
@@ -61,38 +62,67 @@ LOSSES: dict[str, tuple[scores.Score, Cost, Callable[[Array], Array]]] = {
 }
 
 
+Batches = Sequence[tuple[np.ndarray, Measurement]]
+"""which tracks, and their measurements (G, T, ...)"""
+
+
 def loss(
-    kind: str, method: Method, measurements: Measurement, counted: np.ndarray
+    kind: str, method: Method, batches: Batches, counted: Sequence[np.ndarray]
 ) -> Callable[[Any], Array]:
-    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (R, T); those
-    that the filter does not predict are charged."""
+    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (G, T) of each
+    batch; those that the filter does not predict are charged."""
     score, cost, finish = LOSSES[kind]
-    setting = {"prior": method.prior, "t0": 0.0}
-    charging = value_charging(method.estimator, measurements, cost, "charge", setting)
+    charged = [
+        value_charging(
+            method.estimator,
+            measurements,
+            cost,
+            "charge",
+            {"prior": method.prior_of(tracks), "t0": 0.0},
+        )
+        for tracks, measurements in batches
+    ]
 
-    def tracked(params: Any) -> Array:
-        values = charging.scored({**method.params, **params}, None, score)
-        return finish(jnp.where(counted, values, jnp.nan))
+    def loss_of_params(params: Any) -> Array:
+        given = {**method.params, **params}
+        every = [
+            jnp.where(here, charging.scored(given, None, score), jnp.nan).ravel()
+            for charging, here in zip(charged, counted, strict=True)
+        ]
+        return finish(jnp.concatenate(every))
 
-    return tracked
-
-
-def filtered(method: Method, params: Any, measurements: Measurement) -> dict[str, np.ndarray]:
-    """Estimates and diagnostics (R, T, ...) of all tracks, in one batched call."""
-    found = run_batch(
-        method.estimator, params, measurements, prior=method.prior, t0=0.0, observe=_seen, devices=1
-    )
-    arrays = {name: np.asarray(x) for name, x in found.items()}
-    components = np.maximum(np.sum(measurements.mask, -1), 1)
-    return {**arrays, "nis": arrays["nis"] / components}
+    return loss_of_params
 
 
-def report(found: dict[str, np.ndarray], counted: np.ndarray, seed: int) -> dict[str, Any]:
+def filtered(
+    method: Method, params: Any, tracks: Tracks, batches: Batches
+) -> dict[str, np.ndarray]:
+    """Estimates and diagnostics (N, ...) after every row, one batched call for tracks of like
+    length."""
+    every = []
+    for some, measurements in batches:
+        found = run_batch(
+            method.estimator,
+            params,
+            measurements,
+            prior=method.prior_of(some),
+            t0=0.0,
+            observe=_seen,
+            devices=1,
+        )
+        every.append({name: np.asarray(x) for name, x in found.items()})
+    arrays = {name: tracks.flat([found[name] for found in every]) for name in every[0]}
+    return {**arrays, "nis": arrays["nis"] / np.maximum(tracks.mask.sum(-1), 1)}
+
+
+def report(
+    found: dict[str, np.ndarray], row: np.ndarray, counted: np.ndarray, seed: int
+) -> dict[str, Any]:
     """Median and RMSE of the one-step prediction errors in metres, and NIS per component, with
     standard errors by resampling tracks."""
     used = counted & (found["status"] <= Status.LATE_USED) & np.isfinite(found["error"])
-    errors = [row[use] for row, use in zip(found["error"], used, strict=True)]
-    nis_of = [row[use] for row, use in zip(found["nis"], used, strict=True)]
+    cuts = np.searchsorted(row[used], np.arange(1, row.max() + 1))
+    errors, nis_of = (np.split(found[name][used], cuts) for name in ("error", "nis"))
     return {
         "median error [m]": _resampled(errors, np.median, seed),
         "RMSE [m]": _resampled(errors, lambda x: np.sqrt(np.mean(x**2)), seed),

@@ -14,7 +14,7 @@ from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.asd import asd
-from ewif_jax.study.shared.experiment import Refused
+from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track.tracks import Tracks
 from ewif_jax.transforms import Transform, positive
 from ewif_jax.types import Estimator, Gaussian
@@ -37,8 +37,13 @@ UNKNOWN = 1e3
 """Standard deviations at the start, in units of what one interval of measurements tells."""
 
 
+MOST_LAG = 1000
+"""a history that is always allowed; a longer one has to have measurements to hold"""
+
+
 class Method(NamedTuple):
-    """estimator and params; name, unit and transform of the parameter that can be tuned; prior."""
+    """estimator and params; name, unit and transform of the parameter that can be tuned; prior:
+    of all tracks (means (R, n), one covariance)."""
 
     estimator: Estimator
     params: dict[str, Any]
@@ -46,6 +51,10 @@ class Method(NamedTuple):
     unit: str
     transform: Transform
     prior: Gaussian | None
+
+    def prior_of(self, tracks: np.ndarray) -> Gaussian | None:
+        """The prior of some of the tracks."""
+        return None if self.prior is None else Gaussian(self.prior.mean[tracks], self.prior.cov)
 
 
 def method(arguments: Any, tracks: Tracks) -> Method:
@@ -55,7 +64,13 @@ def method(arguments: Any, tracks: Tracks) -> Method:
     tau = 5 dt, and q such that the model's noise over one interval is about as large as s.
     """
     order = list(MODELS).index(arguments.model)
-    dims = tracks.measurements.value.shape[-1]
+    dims = tracks.value.shape[-1]
+    longest = int(np.bincount(tracks.row).max())
+    if arguments.lag > max(longest, MOST_LAG):
+        raise Refused(
+            f"--lag: expected at most {max(longest, MOST_LAG)}, as the longest track has {longest} "
+            f"measurements, got {arguments.lag}"
+        )
     noise, interval = _noise(arguments.noise, tracks.sensors), _interval(tracks)
     sensors = [models.position_sensor(s**2, dims) for s in noise]
     model = MODELS[arguments.model](sensors=sensors, q=lambda p: p["q"], dims=dims)
@@ -64,7 +79,8 @@ def method(arguments: Any, tracks: Tracks) -> Method:
     if arguments.estimator not in ("ewif", "information"):
         spread = UNKNOWN * max(noise) / interval ** np.arange(order + 1)
         mean = np.zeros((len(tracks.name), (order + 1) * dims))
-        mean[:, :dims] = tracks.measurements.value[:, 0]
+        first = tracks.rank() == 0
+        mean[:, :dims] = np.where(tracks.mask, tracks.value, 0)[first]
         prior = Gaussian(jnp.asarray(mean), jnp.diag(jnp.repeat(jnp.asarray(spread**2), dims)))
     q = arguments.q or max(noise) ** 2 / interval ** (2 * order + 1)
     if arguments.estimator == "ewif":
@@ -91,8 +107,8 @@ def _noise(given: dict[str, float], sensors: list[str]) -> list[float]:
 
 def _interval(tracks: Tracks) -> float:
     """The median time between measurements of a track, in seconds."""
-    time = np.where(tracks.present, tracks.measurements.time, np.nan)
-    steps = np.diff(np.sort(time, axis=1), axis=1)
+    order = np.lexsort((tracks.time, tracks.row))
+    steps = np.diff(tracks.time[order])[np.diff(tracks.row) == 0]
     steps = steps[steps > 0]
     return float(np.median(steps)) if steps.size else 1.0
 

@@ -1,35 +1,27 @@
-"""A CSV file of measurements: which column is what, and whether it can be used."""
+"""A file of measurements: which column is what, and whether it can be used."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
-from ewif_jax.study.shared.experiment import Refused
+from ewif_jax.study.shared.refusal import Refused
+from ewif_jax.study.track.columns import EAST, NORTH, Columns, choose_columns, simple
+from ewif_jax.study.track.numbers import decimal_mark, to_numbers
+from ewif_jax.study.track.table import Table, is_missing, read_table
+from ewif_jax.study.track.times import is_of_day, to_seconds
 
-TIMES = ("validity_time", "lastposupdate", "time", "timestamp", "t")
-ARRIVALS = ("arrival", "arrival_time", "received", "report_time", "time")
-TRACKS = ("track", "track_id", "icao24", "object", "target", "id")
-SENSORS = ("sensor", "sensor_id")
-LATLON = (("lat", "lon"), ("latitude", "longitude"))
-VALUES = (("x", "y", "z"), ("x", "y"), ("east", "north"), ("x",), ("value",))
-
-
-class Columns(NamedTuple):
-    """Names of the columns; None where the file has no such thing."""
-
-    time: str
-    arrival: str | None
-    track: str | None
-    sensor: str | None
-    values: tuple[str, ...]
-    geographic: bool
+ABSENT = {"sog": 102.3, "speed": 102.3, "cog": 360.0, "heading": 511.0, "trueheading": 511.0}
+"""How AIS says that a speed, course or heading is not available."""
+NO_LAT, NO_LON = 91.0, 181.0
+YEAR = 3.2e7
 
 
 class Readings(NamedTuple):
     """The rows of a file, in file order: line (N,) numbers, time and arrival (N,) in seconds, track
-    and sensor (N,) names, value (N, m) with NaN where a cell is empty."""
+    and sensor (N,) names, value (N, m) with NaN where there is none. notes: how the file was read;
+    dropped: how many rows or lines were left out, by reason."""
 
     columns: Columns
     line: np.ndarray
@@ -38,134 +30,179 @@ class Readings(NamedTuple):
     track: np.ndarray
     sensor: np.ndarray
     value: np.ndarray
+    notes: tuple[str, ...] = ()
+    dropped: tuple[tuple[str, int], ...] = ()
 
 
 def read(
     path: Path,
     *,
     time: str | None = None,
+    date: str | None = None,
     arrival: str | None = None,
     track: str | None = None,
     sensor: str | None = None,
-    values: list[str] | None = None,
-    latlon: list[str] | None = None,
+    values: Sequence[str] | None = None,
+    latlon: Sequence[str] | None = None,
+    decimal: str | None = None,
+    dates: str | None = None,
 ) -> Readings:
-    """The measurements in `path`; columns that are not named are guessed from common names.
+    """The measurements in `path`; columns that are not named are guessed from common names, and
+    `"none"` says that there is none. `decimal` ("." or ",") and `dates` ("day-first" or
+    "month-first") are what the file shows, unless given.
 
     Raises:
-        Refused: no such file, an empty one, a column that is not there, or a cell that is not a
-            finite number where one is needed; the message names the file, the line and the column.
+        Refused: no such file, an empty one, a column that is not there, a row with more cells than
+            the header, a cell that cannot be read, or a file that can be read in two ways; the
+            message names the file, the line and the column, and how the columns were chosen.
     """
-    table: Any = _table(path)
-    columns = _columns(path, list(table), time, arrival, track, sensor, values, latlon)
-    table = table[(table != "").any(axis=1)]
-    if table.empty:
-        raise Refused(f"{path}: has a header but no rows")
-    stamp = _numbers(path, table, columns.time, needed=True)
+    table = read_table(path)
+    columns = choose_columns(
+        table,
+        time=time,
+        date=date,
+        arrival=arrival,
+        track=track,
+        sensor=sensor,
+        values=values,
+        latlon=latlon,
+    )
+    try:
+        return _read_columns(table, columns, decimal, dates)
+    except Refused as error:
+        advice = "" if not columns.guessed else " (--time, --track none, ... choose others.)"
+        raise Refused(f"{error}\n{columns}{advice}") from None
+
+
+def _read_columns(
+    table: Table, columns: Columns, decimal: str | None, dates: str | None
+) -> Readings:
+    cells = {name: table.column(name) for name in columns.values}
+    stamps = [name for name in (columns.time, columns.arrival) if name is not None]
+    numeric = [*columns.values, *(name for name in stamps if not is_of_day(table.column(name)))]
+    mark = decimal_mark(table, numeric, decimal)
+    stamp = to_seconds(table, columns.time, decimal=mark, dates=dates, date=columns.date)
     arrived = stamp
     if columns.arrival is not None:
-        arrived = _numbers(path, table, columns.arrival, needed=True)
-    value = np.column_stack([_numbers(path, table, name) for name in columns.values])
+        arrived = to_seconds(table, columns.arrival, decimal=mark, dates=dates)
+        apart = float(np.median(np.abs(arrived.seconds - stamp.seconds)))
+        if apart > YEAR:
+            raise Refused(
+                f"{table.path}: columns {columns.time!r} and {columns.arrival!r} are {apart:.3g} s "
+                "apart: they are not of one clock"
+            )
+    notes = [f"Times: {stamp.kind}."]
+    if mark == ",":
+        notes.append("Numbers: decimal commas.")
+    if table.delimiter != ",":
+        name = {"\t": "tabs", ";": "semicolons"}.get(table.delimiter, table.delimiter)
+        notes.append(f"Cells: between {name}.")
+    dropped = dict(table.skipped)
+    signs = np.ones((len(table.rows), len(columns.values)))
     if columns.geographic:
-        _on_earth(path, table, columns, value)
-    nothing = pd.Series("", table.index)
-    names = table[columns.track] if columns.track else nothing
-    sensors = table[columns.sensor] if columns.sensor else nothing
-    line = table.index.to_numpy() + 2
-    return Readings(columns, line, stamp, arrived, names.to_numpy(), sensors.to_numpy(), value)
-
-
-def _table(path: Path) -> Any:
-    """All cells as stripped text, blank lines kept, so that row i is line i + 2."""
-    try:
-        table = pd.read_csv(
-            path,
-            dtype=str,
-            keep_default_na=False,
-            skip_blank_lines=False,
-            index_col=False,
-            encoding="utf-8-sig",
-        )
-    except FileNotFoundError:
-        raise Refused(f"{path}: no such file") from None
-    except pd.errors.EmptyDataError:
-        raise Refused(f"{path}: is empty") from None
-    except (pd.errors.ParserError, UnicodeDecodeError) as error:
-        raise Refused(f"{path}: is not a CSV file: {error}") from None
-    table.columns = table.columns.str.strip()
-    return table.fillna("").apply(lambda column: column.str.strip())
-
-
-def _columns(
-    path: Path,
-    have: list[str],
-    time: str | None,
-    arrival: str | None,
-    track: str | None,
-    sensor: str | None,
-    values: list[str] | None,
-    latlon: list[str] | None,
-) -> Columns:
-    lower = {name.lower(): name for name in reversed(have)}
-
-    def find(role: str, given: str | None, guesses: tuple[str, ...], taken: str = "") -> str | None:
-        if given is not None:
-            if given not in have:
-                raise Refused(f"{path}: has no column {given!r} for {role}; {_listed(have)}")
-            return given
-        found = (lower[guess] for guess in guesses if guess in lower)
-        return next((name for name in found if name != taken), None)
-
-    def all_of(role: str, names: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(str(find(role, name, ())) for name in names)
-
-    def first(groups: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
-        whole = (group for group in groups if all(name in lower for name in group))
-        return next((tuple(lower[name] for name in group) for group in whole), None)
-
-    when = find("--time", time, TIMES)
-    if when is None:
-        raise Refused(f"{path}: say which column is the time (--time); {_listed(have)}")
-    if latlon is not None and len(latlon) != 2:
-        raise Refused(f"--latlon: expected two columns, got {','.join(latlon)}")
-    place = all_of("--latlon", tuple(latlon)) if latlon else None if values else first(LATLON)
-    what = place or (all_of("--values", tuple(values)) if values else first(VALUES))
-    if what is None:
-        raise Refused(
-            f"{path}: say which columns are measured (--values or --latlon); {_listed(have)}"
-        )
-    return Columns(
-        when,
-        find("--arrival", arrival, ARRIVALS, taken=when),
-        find("--track", track, TRACKS),
-        find("--sensor", sensor, SENSORS),
-        what,
-        place is not None,
+        for k, letters in enumerate((NORTH, EAST)):
+            cells[columns.values[k]], signs[:, k] = _hemispheres(table, columns, k, letters)
+    value = np.column_stack([to_numbers(table, name, mark, cells[name]) for name in columns.values])
+    if columns.geographic:
+        _check_signs(table, columns, value, signs)
+        value = value * signs
+    value = _without_absent(table, columns, value, dropped)
+    names = np.array(table.column(columns.track) if columns.track else [""] * len(value), object)
+    if columns.track is not None:
+        names, columns = _track_names(table, columns, names, notes)
+    sensors = np.array(
+        table.column(columns.sensor) if columns.sensor else [""] * len(value), object
+    )
+    nameless = np.array([columns.track is not None and is_missing(name) for name in names])
+    if nameless.all():
+        raise Refused(f"{table.path}: column {columns.track!r} is empty (--track none)")
+    if nameless.any():
+        dropped["rows without the name of a track"] = int(nameless.sum())
+    kept = ~nameless
+    return Readings(
+        columns,
+        np.asarray(table.line)[kept],
+        stamp.seconds[kept],
+        arrived.seconds[kept],
+        names[kept],
+        sensors[kept],
+        value[kept],
+        tuple(notes),
+        tuple(dropped.items()),
     )
 
 
-def _numbers(path: Path, table: Any, name: str, needed: bool = False) -> np.ndarray:
-    """A column as floats: NaN where a cell is empty, unless a number is `needed`."""
-    text = table[name]
-    number = np.asarray(pd.to_numeric(text, errors="coerce"), float)
-    bad = ~np.isfinite(number) & (needed | (text != "").to_numpy())
-    if bad.any():
-        first = int(np.argmax(bad))
-        line, cell = table.index[first] + 2, text.iloc[first]
-        raise Refused(f"{path}, line {line}, column {name!r}: expected a number, got {cell!r}")
-    return number
+def _track_names(
+    table: Table, columns: Columns, names: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, Columns]:
+    """A guessed column that differs in every row numbers the rows, not the tracks."""
+    is_guess = "track" in columns.guessed
+    if is_guess and len(names) > 2 and len(set(names)) == len(names):
+        notes.append(f"Column {columns.track!r} differs in every row: not taken for the track.")
+        return np.full(len(names), "", object), columns._replace(track=None)
+    return names, columns
 
 
-def _on_earth(path: Path, table: Any, columns: Columns, value: np.ndarray) -> None:
-    for name, number, bound in zip(columns.values, value.T, (90, 360), strict=True):
-        bad = np.abs(number) > bound
-        if bad.any():
-            line = table.index[int(np.argmax(bad))] + 2
-            got = number[int(np.argmax(bad))]
-            raise Refused(
-                f"{path}, line {line}, column {name!r}: expected degrees within ±{bound}, got {got}"
-            )
+def _hemispheres(
+    table: Table, columns: Columns, k: int, letters: dict[str, int]
+) -> tuple[list[str], np.ndarray]:
+    """Cells of degrees without their letter, and the signs (N,) that letters in or beside them say
+    (NaN: an unsigned cell without any)."""
+    name = columns.values[k]
+    cells, signs = list(table.column(name)), np.ones(len(table.rows))
+    beside = columns.hemispheres[k] if columns.hemispheres else None
+    sides = table.column(beside) if beside else None
+    lettered = np.zeros(len(cells), bool)
+    for row, cell in enumerate(cells):
+        if is_missing(cell):
+            continue
+        for letter in (cell[:1].lower(), cell[-1:].lower()):
+            if letter in letters:
+                signs[row] = letters[letter]
+                cells[row] = cell.strip("NSEWnsew ").rstrip("\N{DEGREE SIGN} ")
+                lettered[row] = True
+                break
+        if sides is not None:
+            side = sides[row].lower()
+            if side not in letters:
+                raise table.refuse(row, str(beside), f"one of {', '.join(letters)}")
+            if lettered[row] and signs[row] != letters[side]:
+                raise table.refuse(row, name, f"the hemisphere {sides[row]}", cell)
+            signs[row] = letters[side]
+    return cells, signs
 
 
-def _listed(have: list[str]) -> str:
-    return f"it has {', '.join(have)}"
+def _check_signs(table: Table, columns: Columns, value: np.ndarray, signs: np.ndarray) -> None:
+    """A minus and a hemisphere would say the same thing twice, or contradict each other."""
+    for k, name in enumerate(columns.values):
+        beside = columns.hemispheres[k] if columns.hemispheres else None
+        letters = [cell.strip("0123456789.,+- ") for cell in table.column(name)]
+        for row in np.flatnonzero(value[:, k] < 0):
+            if beside is not None or letters[row] or signs[row, k] < 0:
+                raise table.refuse(int(row), name, "degrees without a minus beside a hemisphere")
+
+
+def _without_absent(
+    table: Table, columns: Columns, value: np.ndarray, dropped: dict[str, int]
+) -> np.ndarray:
+    """NaN for what AIS writes where nothing is available; refuses what is not on the earth."""
+    value = value.copy()
+    absent = np.zeros(value.shape, bool)
+    if columns.geographic:
+        absent[:, 0] = np.abs(value[:, 0]) == NO_LAT
+        west = np.abs(value[:, 1])
+        absent[:, 1] = (west == NO_LON) & ~np.any(west[west != NO_LON] > 180)
+        for k, (name, bound) in enumerate(zip(columns.values, (90, 360), strict=True)):
+            bad = (np.abs(value[:, k]) > bound) & ~absent[:, k]
+            if bad.any():
+                row = int(np.argmax(bad))
+                got = float(value[row, k])
+                raise table.refuse(row, name, f"degrees within ±{bound}", got)
+    else:
+        for k, name in enumerate(columns.values):
+            if simple(name) in ABSENT:
+                absent[:, k] = value[:, k] == ABSENT[simple(name)]
+    if absent.any():
+        dropped["values that AIS marks as not available"] = int(absent.any(1).sum())
+    value[absent] = np.nan
+    return value

@@ -1,4 +1,4 @@
-"""Measurements of a file as one padded batch of tracks."""
+"""Measurements of a file as padded batches of tracks of like length."""
 
 from typing import Any, NamedTuple
 
@@ -6,34 +6,83 @@ import numpy as np
 import pandas as pd
 import pyproj
 
-from ewif_jax.study.shared.experiment import Refused
+from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track.readings import Readings
 from ewif_jax.types import Measurement
 
+MOST_PADDING = 4
+"""times as many places as rows in a batch, at most: more batches compile longer, more padding
+computes longer"""
+
+
+class Group(NamedTuple):
+    """G tracks of at most T arrivals, each in order of arrival.
+
+    tracks (G,): which; measurements: a `Measurement` of NumPy arrays (G, T, ...), times from the
+    start of each track; arrival (G, T): report times from there; present (G, T): False is padding.
+    """
+
+    tracks: np.ndarray
+    measurements: Any
+    arrival: np.ndarray
+    present: np.ndarray
+
 
 class Tracks(NamedTuple):
-    """R tracks of at most T arrivals, each in order of arrival.
+    """R tracks with N rows in all.
 
     name (R,); start (R,): time of the first arrival's measurement in seconds; origin (R, 2):
-    latitude and longitude of the local plane's origin, or None; measurements: a `Measurement` of
-    NumPy arrays (R, T, ...), times from the
-    start, values in metres; arrival (R, T): report times from the start; present (R, T): False is
-    padding; line (R, T): in the file; dropped: how many rows were left out, by reason.
+    latitude and longitude of the local plane's origin, or None; groups: the tracks as batches;
+    dropped: how many rows were left out, by reason. The rows, track by track, each in order of
+    arrival: row (N,) the track; line (N,) in the file; time, arrival (N,) from the track's start;
+    value, mask (N, m) in metres.
     """
 
     name: np.ndarray
     start: np.ndarray
     origin: np.ndarray | None
-    measurements: Any
-    arrival: np.ndarray
-    present: np.ndarray
-    line: np.ndarray
+    groups: tuple[Group, ...]
     sensors: list[str]
     dropped: dict[str, int]
+    row: np.ndarray
+    line: np.ndarray
+    time: np.ndarray
+    arrival: np.ndarray
+    value: np.ndarray
+    mask: np.ndarray
+
+    @property
+    def present(self) -> np.ndarray:
+        """The places of all batches, True where there is a row: (R, T) of the only one, or flat."""
+        if len(self.groups) == 1:
+            return self.groups[0].present
+        return np.concatenate([group.present.ravel() for group in self.groups])
+
+    def rank(self) -> np.ndarray:
+        """The place (N,) of each row in its track."""
+        first = np.searchsorted(self.row, self.row)
+        return np.arange(len(self.row)) - first
+
+    def flat(self, of_groups: list[np.ndarray]) -> np.ndarray:
+        """The rows (N, ...) of arrays (G, T, ...), one for each group."""
+        found = np.empty((len(self.row), *of_groups[0].shape[2:]), of_groups[0].dtype)
+        begin = np.searchsorted(self.row, np.arange(len(self.name)))
+        for group, values in zip(self.groups, of_groups, strict=True):
+            for track, here, rows in zip(group.tracks, group.present, values, strict=True):
+                count = int(here.sum())
+                found[begin[track] : begin[track] + count] = rows[:count]
+        return found
+
+    def grouped(self, rows: np.ndarray, fill: Any) -> list[np.ndarray]:
+        """The opposite of `flat`: arrays (G, T, ...) with `fill` where nothing is (None: the last
+        row of the track again)."""
+        parts = np.split(rows, np.searchsorted(self.row, np.arange(1, len(self.name))))
+        return [_padded([parts[track] for track in group.tracks], fill) for group in self.groups]
 
 
 def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) -> Tracks:
-    """Groups, sorts by arrival, drops what says nothing new, turns degrees into metres, and pads.
+    """Groups, sorts by arrival, drops what says nothing new, turns degrees into metres, and pads
+    tracks of like length to batches.
 
     A row says nothing new if it has no value, or repeats an earlier row's track, sensor, time and
     values; with `drop_stale` also if it repeats the values of the row before it.
@@ -52,7 +101,7 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
     if readings.columns.geographic:
         frame.loc[frame[values].isna().any(axis=1), values] = np.nan
     kept = frame[frame[values].notna().any(axis=1)].sort_values("arrival", kind="stable")
-    dropped = {"empty": len(frame) - len(kept)}
+    dropped = {**dict(readings.dropped), "empty": len(frame) - len(kept)}
     repeat = kept.duplicated(["track", "sensor", "time", *values])
     if drop_stale:
         before = kept.groupby(["track", "sensor"])[values].shift()
@@ -65,30 +114,57 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
     if kept.empty:
         raise Refused(f"no track has {min_points} distinct positions (--min-points)")
     sensors = sorted(kept["sensor"].unique())
-    groups = list(kept.groupby("track", sort=True))
-    places = [_local(group[values].to_numpy(), readings.columns.geographic) for _, group in groups]
-    origin = np.array([place[1] for place in places]) if readings.columns.geographic else None
-    start = np.array([group["time"].iloc[0] for _, group in groups])
-    value = _padded([place[0] for place in places], np.nan)
-    present = _padded([np.ones(len(group), bool) for _, group in groups], False)
-    time, arrival = (
-        _padded([group[name].to_numpy() - group["time"].iloc[0] for _, group in groups])
-        for name in ("time", "arrival")
-    )
-    code = [np.searchsorted(sensors, group["sensor"]).astype(np.int32) for _, group in groups]
-    mask = np.isfinite(value) & present[..., None]
-    fields: Any = (time, np.where(mask, value, 0), _padded(code), mask)
-    return Tracks(
-        np.array([name for name, _ in groups]),
+    parts = list(kept.groupby("track", sort=True))
+    places = [_local(part[values].to_numpy(), readings.columns.geographic) for _, part in parts]
+    start = np.array([part["time"].iloc[0] for _, part in parts])
+    size = np.array([len(part) for _, part in parts])
+    row = np.repeat(np.arange(len(parts)), size)
+    every: Any = pd.concat([part for _, part in parts])
+    value = np.concatenate([place[0] for place in places])
+    tracks = Tracks(
+        np.array([name for name, _ in parts]),
         start,
-        origin,
-        Measurement(*fields),
-        arrival,
-        present,
-        _padded([group["line"].to_numpy() for _, group in groups]),
+        np.array([place[1] for place in places]) if readings.columns.geographic else None,
+        tuple(Group(some, None, size, size) for some in _like_lengths(size)),
         sensors,
         {reason: count for reason, count in dropped.items() if count},
+        row,
+        every["line"].to_numpy(),
+        every["time"].to_numpy() - start[row],
+        every["arrival"].to_numpy() - start[row],
+        value,
+        np.isfinite(value),
     )
+    code = np.searchsorted(sensors, every["sensor"]).astype(np.int32)
+    filled = np.where(tracks.mask, value, 0)
+    fields = [
+        tracks.grouped(x, fill)
+        for x, fill in ((tracks.time, None), (filled, None), (code, None), (tracks.mask, False))
+    ]
+    arrivals, places_used = (
+        tracks.grouped(tracks.arrival, None),
+        tracks.grouped(np.ones(len(row), bool), False),
+    )
+    streams = [Measurement(*some) for some in zip(*fields, strict=True)]
+    groups = zip(tracks.groups, streams, arrivals, places_used, strict=True)
+    return tracks._replace(
+        groups=tuple(Group(g.tracks, stream, late, here) for g, stream, late, here in groups)
+    )
+
+
+def _like_lengths(size: np.ndarray) -> list[np.ndarray]:
+    """Tracks to be padded together: all, unless that makes more than `MOST_PADDING` times as many
+    places as rows. Then from the longest down, as many as stay below that."""
+    if size.max() * size.size <= MOST_PADDING * size.sum():
+        return [np.arange(size.size)]
+    order = np.argsort(-size, kind="stable")
+    found, begin = [], 0
+    for end in range(1, size.size + 1):
+        following = order[begin : end + 1]
+        if end == size.size or size[following[0]] > MOST_PADDING * size[following[-1]]:
+            found.append(np.sort(order[begin:end]))
+            begin = end
+    return found
 
 
 def degrees(origin: np.ndarray, metres: np.ndarray) -> np.ndarray:
