@@ -13,6 +13,7 @@ from ewif_jax.checks import Shown
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.models.entry import check_covariances_of, check_times
+from ewif_jax.models.wide_prior import check_prior_width
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -70,7 +71,10 @@ def validated(
     def tried() -> Any:
         model, stamps = estimator.model, measurements.time
         check_covariances_of(model, params, t0, stamps, measurements.sensor)
-        return jax.eval_shape(first)
+        state = jax.eval_shape(first)
+        if hasattr(getattr(state, "current", state), "cov"):  # or it holds a factor, or information
+            check_prior_width(model, params, prior, t0, measurements, dtype)
+        return state
 
     return remembered(question, tried)
 

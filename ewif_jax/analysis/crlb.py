@@ -47,7 +47,8 @@ def crlb(
         information: (n, n) prior information matrix at `time`, or None for nothing.
 
     Returns:
-        (n, n); NaN if the measurements do not determine the state.
+        (n, n); NaN if the measurements do not determine the state, or an R is singular (an exact
+        measurement has no finite information: give it a small variance).
 
     Reduces to: the covariance of `kalman` without process noise; that of `ewif` with its weight.
 
@@ -89,7 +90,8 @@ def _crlb(
         noise = cholesky.factor(gaussian.mask_cov(R, mask))
         white = cholesky.forward(noise, jnp.where(mask[:, None], jax.jacfwd(seen)(state), 0))
         w = 1.0 if weight is None else weight(params, measurement.time, time)
-        return jnp.square(w) * white.T @ white
+        # An exact measurement has no finite information; a skipped pivot would give it none.
+        return jnp.where(noise.full_rank, jnp.square(w) * white.T @ white, jnp.nan)
 
     total = jnp.sum(jax.vmap(one)(stream), 0)
     total = total if information is None else total + information

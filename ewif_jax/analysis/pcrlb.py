@@ -53,7 +53,8 @@ def pcrlb(
 
     Returns:
         (T, n, n) in products of the units of the state (m^2, m^2/s, ... for kinematic models); the
-        square root of a diagonal element bounds an RMSE.
+        square root of a diagonal element bounds an RMSE. NaN from a measurement on whose R is
+        singular: an exact measurement has no finite information (give it a small variance).
 
     Reduces to: the covariance of `kalman` for a linear model; that of `extended` linearised at the
         truth for one trajectory.
@@ -246,10 +247,10 @@ def _information(model: Model, params: Any, states: Array, measurement: Measurem
 
 
 def _precision(H: Array, R: Array, mask: Array) -> Array:
-    """H' R^-1 H over the components that exist."""
+    """H' R^-1 H over the components that exist; NaN where R has no inverse."""
     root = cholesky.factor(gaussian.mask_cov(R, mask))
     white = cholesky.forward(root, jnp.where(mask[:, None], H, 0))
-    return matmul(white.T, white)
+    return jnp.where(root.full_rank, matmul(white.T, white), jnp.nan)
 
 
 def _informed(cov: Array, information: Array) -> Array:

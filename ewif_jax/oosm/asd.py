@@ -157,7 +157,7 @@ def asd(model: Model, lag: int) -> Estimator:
 
     def estimate(params: Any, state: WindowState) -> Gaussian:
         del params
-        return Gaussian(state.mean, symmetric.unpack(state.cov))
+        return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
     return Estimator(init, predict, update, estimate, model=model)
 

@@ -69,7 +69,7 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
 
     def estimate(params: Any, state: HistoryState) -> Gaussian:
         del params
-        return Gaussian(state.mean, symmetric.unpack(state.cov))
+        return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
     return Estimator(init, predict, update, estimate, model=model)
 

@@ -56,7 +56,7 @@ def covariance_form(
 
     def estimate(params: Any, state: CovarianceState) -> Gaussian:
         del params
-        return Gaussian(state.mean, symmetric.unpack(state.cov))
+        return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
     return estimator_from(
         Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)

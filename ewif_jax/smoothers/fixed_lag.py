@@ -107,6 +107,7 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         half = state.cov - matmul(gain, seen.cross)
         correction = matmul(gain, gaussian.mask_cov(R, mask)) - matmul(half[:, :n], H.T)
         cov = half + matmul(correction, gain.T)
+        cov = jnp.where(jnp.eye(len(cov), dtype=bool) & (cov < 0), 0, cov)  # rounding
         mean = state.mean + matmul(gain, seen.value[:, None]).reshape(slots, n)
         used = present & ~late
         info = Info(
