@@ -9,13 +9,17 @@ import pytest
 import ewif_jax as ej
 from laws.cases import close
 
-A, PUSH = np.array([[0.0, 1.0], [-0.2, -0.3]]), np.array([0.1, -0.05])
-DT = 0.5
+PUSH, DT = np.array([0.1, -0.05]), 0.5
 H, R = np.array([[1.0, 0.0]]), np.array([[0.4]])
 
 
+def gathered(params, t0, t1):
+    dt = t1 - t0
+    return jnp.stack([PUSH[0] * dt + PUSH[1] * dt**2 / 2, PUSH[1] * dt])
+
+
 def of_intervals(q=lambda p: p["q"]):
-    return ej.models.from_continuous(A, np.eye(2)[:, 1:], q, H=H, R=R, b=PUSH)
+    return ej.models.constant_velocity(sensors=ej.models.position_sensor(0.4), q=q, b=gathered)
 
 
 def of_steps():
