@@ -1,5 +1,6 @@
 """What is checked before a stream is filtered, and the trial of one arrival."""
 
+from collections.abc import Hashable
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.recipe import digest
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -50,16 +52,21 @@ def validated(
             one = one._replace(sensor=last)
         return arrive(estimator, given, state, one, None if times is None else times[0]).kept
 
-    shapes = np.shape(measurements.value), times is None, clock
-    setting = str(dtype), key is None, bool(jax.config.jax_enable_x64)  # pyright: ignore
-    leaves, structure = jax.tree.flatten((params, prior, t0, last))
     # Trying takes longer than filtering a short stream, so equal trials are made once.
-    values = [None if isinstance(x, Tracer) else np.asarray(x) for x in leaves]
-    asked = None
-    if all(value is not None for value in values):
-        asked = question_of(estimator, shapes, setting, values)
-    question = None if asked is None else (validated, structure, asked)
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
+    setting = np.shape(measurements.value), times is None, clock, dtype, key is None, x64
+    question = _question(estimator, setting, (params, prior, t0, last))
     return remembered(question, lambda: jax.eval_shape(first))
+
+
+def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable | None:
+    """What tells this trial from others; None while something is being traced."""
+    filtered = question_of(estimator)
+    leaves, structure = jax.tree.flatten(values)
+    if filtered is None or any(isinstance(x, Tracer) for x in leaves):
+        return None
+    known = map(np.asarray, leaves)
+    return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in known)
 
 
 def _indexable(x: Any) -> Any:
