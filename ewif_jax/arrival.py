@@ -40,9 +40,11 @@ def screen(measurements: Measurement, dtype: Any) -> Screened:
     xp = jnp if any(isinstance(x, Array) for x in (time, value, mask)) else np
     with np.errstate(over="ignore", invalid="ignore"):
         squares = xp.square(xp.asarray(value, dtype))
-        finite = xp.isfinite(xp.asarray(time, dtype)) & xp.all(xp.isfinite(squares) | ~mask, -1)
-    refused = xp.any(mask, -1) & ~finite
-    return Screened(Measurement(time, value, sensor, mask & finite[..., None]), refused)
+        present = xp.broadcast_to(mask, np.shape(value))
+        is_time = xp.broadcast_to(xp.isfinite(xp.asarray(time, dtype)), np.shape(value)[:-1])
+        finite = is_time & xp.all(xp.isfinite(squares) | ~present, -1)
+    refused = xp.any(present, -1) & ~finite
+    return Screened(Measurement(time, value, sensor, present & finite[..., None]), refused)
 
 
 def marked(info: Info, refused: Any) -> Info:

@@ -149,11 +149,8 @@ def _screened(loop: Loop, estimator: Estimator, inputs: Any, flags: Any, dtype: 
     kept, refused = screen(measurements, dtype)
 
     def own_masks() -> Any:
-        rows = jnp.broadcast_to(refused, measurements.value.shape[:2])
-        mask = jnp.broadcast_to(kept.mask, measurements.value.shape)
-        masked = kept._replace(mask=mask)
         masked_f = measurements_f._replace(mask=True)
-        own = (params, masked, prior, times, keys, (context, rows))
+        own = (params, kept, prior, times, keys, (context, refused))
         own_f = (params_f, masked_f, prior_f, times_f, keys_f, (context_f, True))
         return over_runs(loop, estimator.estimate, own, own_f)
 

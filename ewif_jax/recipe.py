@@ -225,13 +225,13 @@ def _kind(x: Any) -> type:
 def _array_key(x: Any) -> Hashable:
     if isinstance(x, np.ma.MaskedArray):
         return np.ma.MaskedArray, _array_key(x.data), _array_key(np.ma.getmaskarray(x))
-    dtype = str(x.dtype)
+    dtype = x.dtype
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)
     value = np.asarray(x)
     if value.dtype.hasobject:
         return Same(x)
-    return np.ndarray, value.shape, dtype, digest(value), getattr(x, "weak_type", False)
+    return value.shape, dtype, digest(value), getattr(x, "weak_type", False)
 
 
 def digest(value: np.ndarray) -> bytes:

@@ -1,5 +1,6 @@
 """What is checked before a stream is filtered, and the trial of one arrival."""
 
+from collections.abc import Hashable
 from typing import Any
 
 import jax
@@ -13,7 +14,8 @@ from ewif_jax.checks import Shown
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.models.entry import check_covariances_of, check_times
-from ewif_jax.models.wide_prior import check_prior_width
+from ewif_jax.models.wide_prior import check_prior_width, first_rows
+from ewif_jax.recipe import digest
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Estimator, Gaussian, Measurement
 
@@ -58,25 +60,29 @@ def validated(
         _require_same_shapes(state, kept)
         return kept
 
-    shapes = np.shape(measurements.value), times is None, clock
-    setting = str(dtype), key is None, bool(jax.config.jax_enable_x64)  # pyright: ignore
-    leaves, structure = jax.tree.flatten((params, prior, t0, last))
     # Trying takes longer than filtering a short stream, so equal trials are made once.
-    values = [None if isinstance(x, Tracer) else np.asarray(x) for x in leaves]
-    asked = None
-    if all(value is not None for value in values):
-        asked = question_of(estimator, shapes, setting, values)
-    question = None if asked is None else (validated, structure, asked)
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
+    setting = np.shape(measurements.value), times is None, clock, dtype, key is None, x64
+    question = _question(estimator, setting, (params, prior, t0, last))
 
     def tried() -> Any:
         model, stamps = estimator.model, measurements.time
         check_covariances_of(model, params, t0, stamps, measurements.sensor)
-        state = jax.eval_shape(first)
-        if hasattr(getattr(state, "current", state), "cov"):  # or it holds a factor, or information
-            check_prior_width(model, params, prior, t0, measurements, dtype)
-        return state
+        return jax.eval_shape(first)
 
-    return remembered(question, tried)
+    state = remembered(question, tried)
+    # A factor or information holds any prior: only what keeps a covariance is asked.
+    rows = first_rows(measurements, prior, t0)
+    model = estimator.model
+    if (
+        prior is not None
+        and rows is not None
+        and model is not None
+        and hasattr(getattr(state, "current", state), "cov")
+    ):
+        asked = _question(estimator, setting, (params, prior, t0, rows))
+        remembered(asked, lambda: check_prior_width(model, params, prior, t0, rows, dtype))
+    return state
 
 
 def _require_same_shapes(before: Any, after: Any) -> None:
@@ -86,6 +92,16 @@ def _require_same_shapes(before: Any, after: Any) -> None:
     same = jax.tree.structure(before) == jax.tree.structure(after) and old == new
     expected = f"values with which a step keeps the shapes of the state, {old}"
     checks.require(same, "params", expected, Shown(new))
+
+
+def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable | None:
+    """What tells this trial from others; None while something is being traced."""
+    filtered = question_of(estimator)
+    leaves, structure = jax.tree.flatten(values)
+    if filtered is None or any(isinstance(x, Tracer) for x in leaves):
+        return None
+    known = map(np.asarray, leaves)
+    return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in known)
 
 
 def _indexable(x: Any) -> Any:

@@ -88,10 +88,11 @@ def once(check: Callable[Given, Answer]) -> Callable[Given, Answer]:
         arrays = [x for x in leaves if isinstance(x, Array)]
         if not arrays or len(leaves) > MOST_LEAVES or not all(map(_is_fixed, leaves)):
             return check(*args, **kwargs)
-        question = question_of(check, [[id(x)] if isinstance(x, Array) else x for x in leaves])
-        if question is None:
+        try:
+            told = [id(x) if isinstance(x, Array) else (content_key(x),) for x in leaves]
+        except NotConcreteError:
             return check(*args, **kwargs)
-        question = question, structure
+        question = check, structure, *told
         kept = ANSWERS.get(question)
         # An array that came to where another one was is not that one.
         if isinstance(kept, tuple) and all(

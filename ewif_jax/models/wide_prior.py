@@ -19,31 +19,28 @@ m, 90 runs in float32: 0.07 (a prior 1e6 times R) is off by 0.005 sigma at most,
 6 (1e8) by 0.8 and has negative variances."""
 
 
-def check_prior_width(
-    model: Model | None,
-    params: Any,
-    prior: Gaussian | None,
-    t0: Any,
-    measurements: Measurement,
-    dtype: Any,
-) -> None:
-    """Refuses a known prior so wide that the first updates leave variances that are mostly what a
-    covariance in `dtype` was rounded by."""
-    given = params, prior, t0, measurements.time, measurements.sensor, measurements.mask
-    leaves = jax.tree.leaves(given)
-    if model is None or prior is None or any(checks.known(x) is None for x in leaves):
-        return
-    cov = np.asarray(prior.cov, float)
-    if np.ndim(measurements.time) != 1:
-        return
-    eps = float(jnp.finfo(dtype).eps)
-    seen = np.flatnonzero(np.asarray(measurements.mask).any(-1))[: 4 * len(cov)]
+def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Any) -> Any:
+    """Times and sensors of the first measurements that come in sequence, which tell whether a prior
+    is too wide; None where something of it is traced."""
+    given = prior, t0, measurements.time, measurements.sensor, measurements.mask
+    concrete = all(checks.known(x) is not None for x in jax.tree.leaves(given))
+    if prior is None or not concrete or np.ndim(measurements.time) != 1:
+        return None
+    seen = np.flatnonzero(np.asarray(measurements.mask).any(-1))[: 4 * np.shape(prior.cov)[0]]
     times = np.asarray(measurements.time, float)[seen]
     in_sequence = times >= np.maximum.accumulate(np.append(float(t0), times))[:-1]
-    seen, times = seen[in_sequence], times[in_sequence]
     sensors = np.asarray(measurements.sensor, np.int32)[seen]
-    if not seen.size:
-        return
+    return (times[in_sequence], sensors[in_sequence]) if in_sequence.any() else None
+
+
+def check_prior_width(
+    model: Model, params: Any, prior: Gaussian, t0: Any, rows: Any, dtype: Any
+) -> bool:
+    """True, unless a known prior is so wide that the first updates (`first_rows`) leave variances
+    that are mostly what a covariance in `dtype` was rounded by: that is refused."""
+    cov = np.asarray(prior.cov, float)
+    eps = float(jnp.finfo(dtype).eps)
+    times, sensors = rows
     with jax.ensure_compile_time_eval():
         noises = [
             np.diag(np.asarray(model.measurement_cov(params, s, times[0])))
@@ -52,11 +49,11 @@ def check_prior_width(
         noise = np.concatenate(noises).min()
         gap = np.diff(times, prepend=float(t0)).max()
         if not np.diag(cov).max() * max(1.0, gap) ** 2 * eps > LIMIT / 10 * noise:
-            return  # a look without a program of its own: most priors are far from the limit
+            return True  # a look without a program of its own: most priors are far from the limit
         stamps = np.append(float(t0), times).astype(dtype)
         mean = jnp.asarray(prior.mean, dtype)
-        rows = _matrices(model, params, mean, stamps[:-1], stamps[1:], sensors)
-    share = _rounding(cov, [np.asarray(x, float) for x in rows], eps)
+        matrices = _matrices(model, params, mean, stamps[:-1], stamps[1:], sensors)
+    share = _rounding(cov, [np.asarray(x, float) for x in matrices], eps)
     checks.require(
         share <= LIMIT,
         "prior.cov",
@@ -66,6 +63,7 @@ def check_prior_width(
         f"variances up to {np.diag(cov).max():.3g}, of which rounding alone is {share:.2g} times "
         "what the first measurements leave",
     )
+    return True
 
 
 @partial(jax.jit, static_argnames="model")

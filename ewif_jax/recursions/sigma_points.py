@@ -15,8 +15,8 @@ from ewif_jax.models.linearise import patterns, predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
-from ewif_jax.recursions.innovations import Compared, numbers, unjudged, updated
-from ewif_jax.types import Info, Measurement, Status
+from ewif_jax.recursions.innovations import Compared, info_of, numbers, updated
+from ewif_jax.types import Info, Measurement
 
 ROUNDING = 1e-4
 """The largest share of a value that the weights may turn rounding into."""
@@ -132,8 +132,7 @@ def measure_around(
     difference, slope, R = (jnp.where(good, x, 0) for x in (difference, slope, R))
     mask = mask & good
     mean, cov, innovation = sigma_points.update(mean, lower, difference, slope, R, mask)
-    info = unjudged(innovation, mask)
-    return mean, cov, info._replace(status=jnp.where(good, info.status, jnp.int32(Status.REJECTED)))
+    return mean, cov, info_of(innovation, mask, good)
 
 
 def _root(cov: Array, n: int) -> cholesky.Factor:
