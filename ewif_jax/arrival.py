@@ -40,7 +40,7 @@ def screen(measurements: Measurement, dtype: Any) -> Screened:
     xp = jnp if any(isinstance(x, Array) for x in (time, value, mask)) else np
     with np.errstate(over="ignore", invalid="ignore"):
         squares = xp.square(xp.asarray(value, dtype))
-        present = xp.broadcast_to(mask, np.shape(value))
+        present: Any = xp.broadcast_to(mask, np.shape(value))
         is_time = xp.broadcast_to(xp.isfinite(xp.asarray(time, dtype)), np.shape(value)[:-1])
         finite = is_time & xp.all(xp.isfinite(squares) | ~present, -1)
     refused = xp.any(present, -1) & ~finite
