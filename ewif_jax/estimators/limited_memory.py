@@ -1,5 +1,6 @@
 """The limited-memory filter: least squares over a sliding window."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -57,7 +58,8 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> WindowState:
         del key
         checks.positive("window", resolve(window, params))
-        start = form.start(model, params, prior, t0)
+        form.refuse_exact(model, params, t0, "limited_memory")
+        start = form.start(model, params, prior, t0, ())
         m = jax.eval_shape(
             lambda: jnp.asarray(linear.H(params, jnp.zeros((), jnp.int32), start.time))
         ).shape[0]
@@ -70,27 +72,21 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         return WindowState(start.time, start, buffer)
 
     def fit(params: Any, state: WindowState, time: Array) -> InformationState:
-        """Everything inside the window, at `time`, refined once against rounding."""
+        """Everything inside the window, at `time`."""
         half = resolve(window, params)
         inside = jnp.abs(time - state.start.time) <= half
-        base = form.transport(model, params, state.start, time, jnp.where(inside, 1.0, 0.0))
+        counted = jnp.where(inside, state.start.variances, jnp.inf)
+        base = state.start._replace(variances=counted)
+        base = form.transport(model, params, base, jnp.where(inside, time, base.time), 1.0)
+        base = base._replace(time=time)
         stamps = state.buffer.time
         near = jnp.abs(time - stamps) <= half
         safe = state.buffer._replace(
             time=jnp.where(near, stamps, time), mask=state.buffer.mask & near[:, None]
         )
-
-        def gather(around: InformationState) -> InformationState:
-            parts = jax.vmap(lambda one: form.contribution(model, params, around, one))(safe)
-            return around._replace(
-                matrix=base.matrix + jnp.sum(parts[0], 0),
-                vector=base.vector
-                + form.times(base.matrix, base.mean - around.mean)
-                + jnp.sum(parts[1], 0),
-            )
-
-        once = form.recentred(gather(base))
-        return gather(once._replace(vector=jnp.zeros_like(once.vector)))
+        told, targets, noise = jax.vmap(partial(form.contribution, model, params, base))(safe)
+        flat = told.reshape(-1, told.shape[-1]), noise.ravel(), targets.ravel()
+        return form.recentred(form.gathered(base, *flat))
 
     def predict(params: Any, state: WindowState, time: Array) -> WindowState:
         del params
@@ -104,14 +100,14 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         out = (state.time - measurement.time > resolve(window, params)) | (
             measurement.time < state.buffer.time[oldest]
         )
-        used = present & ~out
         buffer = jax.tree.map(lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement)
         before = fit(params, state, state.time)
-        _, info = form.absorb(model, params, before, measurement, 1.0)
+        _, info, good = form.absorb(model, params, before, measurement, 1.0)
         late = jnp.where(out, Status.TOO_LATE, Status.LATE_USED)
+        used = present & ~out & good
         info = info._replace(
             log_likelihood=jnp.where(used, info.log_likelihood, 0),
-            status=verdict(measurement.time < state.time, present, late),
+            status=verdict(measurement.time < state.time, present, late, good),
         )
         return choose(used, state._replace(buffer=buffer), state), info
 

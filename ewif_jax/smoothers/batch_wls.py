@@ -12,6 +12,7 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.model import Model, affine_flow, need_linear, observation
+from ewif_jax.recursions.information import refuse_exact
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
@@ -64,6 +65,7 @@ def batch_wls(
     need_linear(model, "batch_wls")
     checks.stream(measurements)
     checks.sensors(measurements, model.sensors)
+    refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "batch_wls")
     checks.shape("times", times, ("K",))
     checks.finite("times", times)
     checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
@@ -101,13 +103,14 @@ def _batch_wls(
         target = model.residual(measurement.value, known, measurement.sensor)
         rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
-        return weight(params, measurement.time, time) * cholesky.forward(noise, rows)
+        white = jnp.where(noise.full_rank, cholesky.forward(noise, rows), jnp.nan)
+        return _weighted(weight(params, measurement.time, time), white)
 
     def believed_from(time: Array, prior: Gaussian) -> Array:
         A, c = affine_flow(model, params, time, t0, dtype)
         target = prior.mean if c is None else prior.mean - c
         spread = cholesky.factor(prior.cov)
-        return weight(params, t0, time) * cholesky.forward(spread, jnp.c_[A, target])
+        return _weighted(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
 
     def at(time: Array) -> Gaussian:
         rows = jax.vmap(partial(seen_from, time))(measurements)
@@ -117,6 +120,11 @@ def _batch_wls(
         return _least_squares(rows[:, :-1], rows[:, -1])
 
     return lax.map(at, times, batch_size=REPORTS_AT_ONCE)
+
+
+def _weighted(weight: Array, rows: Array) -> Array:
+    """What counts nothing is left out, whatever its rows are."""
+    return weight * jnp.where(weight == 0, 0, rows)
 
 
 def _least_squares(rows: Array, target: Array) -> Gaussian:

@@ -11,7 +11,6 @@ from ewif_jax import checks
 from ewif_jax.models.model import Model, need_linear, resolve
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.recursions.passage import joined
 from ewif_jax.streams import cast, float_dtype
 from ewif_jax.types import Gaussian, Measurement
 
@@ -60,6 +59,8 @@ def two_sided_ewif(
     checks.stream(measurements)
     checks.sensors(measurements, model.sensors)
     checks.positive("tau", resolve(tau, params))
+    form.refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
+    form.refuse_one_way(model, params, "two_sided_ewif")
     dtype = float_dtype(measurements.value)
     if times is not None:
         checks.shape("times", times, ("K",))
@@ -91,7 +92,7 @@ def _two_sided(
 
     def moved(state: InformationState, time: Array) -> InformationState:
         return form.transport(
-            model, params, state, time, jnp.exp(-jnp.abs(time - state.time) / tau)
+            model, params, state, time, form.exponential(jnp.abs(time - state.time), tau)
         )
 
     def gathered(reverse: bool) -> InformationState:
@@ -100,7 +101,7 @@ def _two_sided(
 
         def body(state: InformationState, measurement: Measurement):
             here = moved(state, measurement.time)
-            state, _ = form.absorb(model, params, here, measurement, 1.0)
+            state, _, _ = form.absorb(model, params, here, measurement, 1.0)
             return state, state
 
         _, states = lax.scan(body, nothing, in_time, reverse=reverse)
@@ -115,6 +116,7 @@ def _two_sided(
         sources = [jax.tree.map(lambda x: x[k], side) for side in (past, future)]
         if prior is not None:
             sources.append(form.start(model, params, prior, t0))
-        return form.estimate(reduce(joined, [moved(source, time) for source in sources]))
+        moved_here = [moved(source, time) for source in sources]
+        return form.estimate(form.recentred(reduce(form.joined, moved_here)))
 
     return jax.vmap(at)(times, count)
