@@ -160,10 +160,8 @@ def _carried_in(
         return seconds if none else jax.vmap(together)(firsts, seconds)
 
     vague = stretches[0].vague  # as everything of which a prefix sum is made
-    nothing_before = (
-        start._replace(vague=vague),
-        way.standstill(*start.mean.shape, start.mean.dtype),
-    )
+    still = way.standstill(start.mean.shape[0], start.mean.dtype)
+    nothing_before = start._replace(vague=vague), still
     links = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), nothing_before, stretches)
     return lax.associative_scan(pairwise, links)[0]._replace(vague=start.vague)
 

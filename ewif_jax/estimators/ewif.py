@@ -55,8 +55,8 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         which is not the covariance of the error under its model (3).
 
     Raises:
-        ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear; a singular R; a
-            constant F without inverse.
+        ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear; a
+            singular R; a constant F without inverse.
     """
     need_linear(model, "ewif")
     one = (tau is None) != (weight is None)

@@ -21,15 +21,17 @@ def information(model: Model) -> Estimator:
     .. math::
         P_k^{-1} = A' (P_{k-1} + A Q A')^{-1} A + H' R^{-1} H \quad (33)
 
-    with A back from k to k-1: Shulami & Sigalov, eqs. (32)-(33). Neither Q nor R nor the information
-    matrix has to be invertible. `prior=None` as in `ewif`, late measurements as in `kalman`.
+    with A back from k to k-1: Shulami & Sigalov, eqs. (32)-(33). Neither Q nor R nor the
+    information matrix has to be invertible. `prior=None` as in `ewif`, late measurements as in
+    `kalman`.
 
     Reduces to: `kalman` with the same prior.
 
     Deviations: (32)-(33) print Q with indices (k-1, k); it is the Q (k, k-1) of (31).
 
     Raises:
-        ValueError: the model is not linear; a prior with a singular covariance; with `prior=None` a constant F without inverse.
+        ValueError: the model is not linear; a prior with a singular covariance; with
+            `prior=None` a constant F without inverse.
     """
     need_linear(model, "information")
 

@@ -10,6 +10,7 @@ Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n
 
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,8 +30,18 @@ def strict(full: Array) -> Array:
     return _strict(full)
 
 
+def solved(rows: Array, targets: Array) -> Array:
+    """The solution (n,) of the equations."""
+    return _solved(rows, targets)
+
+
+def times(rows: Array, x: Array) -> Array:
+    """What the left-hand sides (n,) are at x (n,)."""
+    return _times(rows, x)
+
+
 def absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array
+    variances: Array, rows: Array, equation: Array, noise: Array, vague: bool = True
 ) -> tuple[Array, Array, Array, Array]:
     """Variances and rows with one more `equation` (n,), whose error has variance `noise` ().
 
@@ -57,7 +68,7 @@ def inverse(rows: Array) -> Array:
 
 
 def covariance(inverse_rows: Array, variances: Array) -> Array:
-    """B diag(variances) B' (n, n), whose variances are sums of squares."""
+    """The upper triangle of B diag(variances) B', row by row: its variances are sums of squares."""
     return _covariance(inverse_rows, variances)
 
 
@@ -105,7 +116,57 @@ def _strict(full: Array) -> Array:
 
 def _pieces(rows: Array, n: int) -> list[Array]:
     ends = np.cumsum([0, *range(n - 1, -1, -1)])
-    return [rows[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [rows[a:b] for a, b in pairwise(ends)]
+
+
+@kernel
+def _solved(rows: Array, targets: Array) -> Array:
+    n, found = targets.shape[0], []
+    for k, row in reversed(list(enumerate(_pieces(rows, n)))):
+        terms = [targets[k], *(-row[j] * x for j, x in enumerate(found))]
+        found.insert(0, total(terms))
+    return jnp.stack(found)
+
+
+@kernel
+def _times(rows: Array, x: Array) -> Array:
+    n = x.shape[0]
+    pieces = enumerate(_pieces(rows, n))
+    return jnp.stack(
+        [total([x[k], *(row[j] * x[k + 1 + j] for j in range(n - 1 - k))]) for k, row in pieces]
+    )
+
+
+@kernel
+def _refined(
+    variances: Array, rows: Array, equation: Array, noise: Array
+) -> tuple[Array, Array, Array, Array]:
+    n, batch = equation.shape[0], equation.ndim - 1
+    found = []
+    for k, row in enumerate(_pieces(rows, n)):
+        lead = equation[0]
+        variance, noise, step = stage(_shared, variances[k], noise, lead, batch=batch)
+        if k < n - 1:
+            row, equation = stage(_turned, row, equation[1:], lead, step, batch=batch)
+        found.append((variance, row, lead, step))
+    return _together(found, rows)
+
+
+def _shared(variance: Array, noise: Array, lead: Array) -> tuple[Array, Array, Array]:
+    """`_met` where nothing is unknown."""
+    told = ~jnp.isinf(noise)
+    r = jnp.where(told, noise, 0)
+    gain = lead * variance
+    both = r + lead * gain
+    some = told & (both > 0)
+    share = jnp.where(some, 1 / jnp.where(some, both, 1), 0)
+    kept = jnp.where(some, r * share, 1)
+    return variance * kept, jnp.where(told, both, jnp.inf), gain * share
+
+
+def _turned(row: Array, rest: Array, lead: Array, step: Array) -> tuple[Array, Array]:
+    rest = rest - lead[None] * row
+    return row + step[None] * rest, rest
 
 
 @kernel
@@ -123,6 +184,12 @@ def _absorbed(
                 _taken_out, row, equation[1:], scale[1:], lead, step, batch=batch
             )
         found.append((variance, row, lead, step))
+    return _together(found, rows)
+
+
+def _together(
+    found: list[tuple[Array, Array, Array, Array]], rows: Array
+) -> tuple[Array, Array, Array, Array]:
     variances, leads, steps = (jnp.stack([x[i] for x in found]) for i in (0, 2, 3))
     runs = jnp.broadcast_shapes(variances.shape[1:], rows.shape[1:])
     parts = [jnp.broadcast_to(x[1], (len(x[1]), *runs)) for x in found]
@@ -213,10 +280,7 @@ def _covariance(inverse_rows: Array, variances: Array) -> Array:
     n = variances.shape[0]
     scaled = inverse_rows * variances[None]
     i, j = np.triu_indices(n)
-    packed = total(scaled[i, k] * inverse_rows[j, k] for k in range(n))
-    where = np.zeros((n, n), int)
-    where[i, j] = where[j, i] = np.arange(i.size)
-    return packed[where]
+    return total(scaled[i, k] * inverse_rows[j, k] for k in range(n))
 
 
 @kernel

@@ -113,7 +113,7 @@ def moved(
     else:
         both = jnp.concatenate([variances, jnp.ones_like(variances)])
         kept, rows = equations.spread(jnp.concatenate([vectors, noise], 1), both)
-    targets = matvec(equations.upper(rows), error)
+    targets = equations.times(rows, error)
     certain = state._replace(variances=kept, rows=rows, targets=targets)
     if state.vague is None:
         return certain
@@ -153,8 +153,9 @@ def gathered(
 
     def add(known: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[Any, None]:
         equation, variance, target = new
-        kept, rows, leads, steps = equations.absorbed(*known[:2], equation, variance)
-        return (kept, rows, equations.answered(known[2], target, leads, steps)), None
+        kept, rows, answers = known
+        kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance)
+        return (kept, rows, equations.answered(answers, target, leads, steps)), None
 
     before = state.variances, state.rows, state.targets
     (kept, rows, answers), _ = lax.scan(add, before, (told, variances, targets))
@@ -173,9 +174,7 @@ def joined(a: InformationState, b: InformationState) -> InformationState:
 def recentred_on(state: InformationState, mean: Array) -> InformationState:
     """The same information around another reference."""
     shift = state.mean - mean
-    return state._replace(
-        mean=mean, targets=state.targets + matvec(equations.upper(state.rows), shift)
-    )
+    return state._replace(mean=mean, targets=state.targets + equations.times(state.rows, shift))
 
 
 def blended(old: InformationState, new: InformationState, share: Array) -> InformationState:
@@ -194,18 +193,21 @@ def absorb(
     exact: bool = False,
 ) -> tuple[InformationState, Info, Array]:
     """The state with a measurement of any time, its R times `growth`; `Info`, with the status left
-    at 0 for the caller to set; and whether the measurement is any good: one that is not finite, or
-    seen through a motion that has no way back, or (unless `exact`) without noise is not used."""
+    at 0 for the caller to set; and whether the measurement is any good: one seen
+    through a motion that has no way back, or (unless `exact`) without noise is not used."""
     seen, difference, R = _sight(model, params, state, measurement)
     mask = measurement.mask
-    noise, good = _noise(gaussian.mask_cov(R, mask), seen, difference, exact)
+    # No value decides here: runs that differ only in their values share what is not the targets.
+    noise, good = _noise(gaussian.mask_cov(R, mask), seen, exact)
     used = good & jnp.any(mask)
     usable, residual = jnp.where(good, seen, 0), jnp.where(good, difference, 0)
     told, apart = cholesky.forward(noise.unit, usable), cholesky.forward(noise.unit, residual)
     spreads = jnp.where(used & mask, noise.variances * growth, jnp.inf)
     variances, rows, targets = state.variances, state.rows, state.targets
     for k in range(mask.shape[0]):  # apart from the targets it depends on no data: runs share it
-        variances, rows, leads, steps = equations.absorbed(variances, rows, told[k], spreads[k])
+        variances, rows, leads, steps = equations.absorbed(
+            variances, rows, told[k], spreads[k], state.vague is not None
+        )
         targets = equations.answered(targets, apart[k], leads, steps)
     updated = state._replace(variances=variances, rows=rows, targets=targets)
     info = _info(state, usable, residual, R * growth, measurement, good)
@@ -219,7 +221,7 @@ def contribution(
     variances (m,), infinite where nothing is said."""
     seen, difference, R = _sight(model, params, state, measurement)
     mask = measurement.mask
-    noise, good = _noise(gaussian.mask_cov(R, mask), seen, difference)
+    noise, good = _noise(gaussian.mask_cov(R, mask), seen)
     told = cholesky.forward(noise.unit, jnp.where(good, seen, 0))
     targets = cholesky.forward(noise.unit, jnp.where(good, difference, 0))
     return told, targets, jnp.where(good & mask, noise.variances, jnp.inf)
@@ -234,13 +236,11 @@ def determined(state: InformationState) -> Array:
 
 def recentred(state: InformationState, used: Array | bool = True) -> InformationState:
     """The same information around the estimate, if there is one."""
-    shift = matvec(equations.inverse(state.rows), state.targets)
+    shift = equations.solved(state.rows, state.targets)
     shift = jnp.where(determined(state) & used, shift, 0)
     mean = state.mean + shift
     made = mean - state.mean  # what rounding lets the mean move by
-    return state._replace(
-        mean=mean, targets=state.targets - matvec(equations.upper(state.rows), made)
-    )
+    return state._replace(mean=mean, targets=state.targets - equations.times(state.rows, made))
 
 
 def estimate(state: InformationState) -> Gaussian:
@@ -249,7 +249,10 @@ def estimate(state: InformationState) -> Gaussian:
     known = determined(state)
     variances = jnp.where(known, state.variances, 1)
     cov = equations.covariance(equations.inverse(state.rows), variances)
-    return Gaussian(jnp.where(known, state.mean, jnp.nan), jnp.where(known, cov, jnp.nan))
+    return Gaussian(
+        jnp.where(known, state.mean, jnp.nan),
+        symmetric.unpack(jnp.where(known, cov, jnp.nan)),
+    )
 
 
 def grown(variances: Array, growth: Array | float) -> Array:
@@ -374,14 +377,14 @@ class _Noise(NamedTuple):
     variances: Array
 
 
-def _noise(R: Array, seen: Array, difference: Array, exact: bool = False) -> tuple[_Noise, Array]:
+def _noise(R: Array, seen: Array, exact: bool = False) -> tuple[_Noise, Array]:
     """R taken apart, and whether the measurement is any good."""
     m = R.shape[0]
     found = cholesky.factor(R)
     diagonal = jnp.diagonal(found.lower)
     eye = jnp.eye(m, dtype=R.dtype)
     unit = jnp.where(eye > 0, 1, matmul(found.lower, eye * found.reciprocal[None]))
-    fine = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(difference))
+    fine = jnp.all(jnp.isfinite(seen))
     psd = jnp.all(jnp.isfinite(R)) & jnp.all(jnp.diagonal(R) >= 0)
     allowed = psd if exact else psd & found.full_rank
     factor = cholesky.Factor(unit, jnp.ones(m, R.dtype), found.full_rank)
