@@ -11,7 +11,9 @@ Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -155,13 +157,39 @@ def _refined(
 def _shared(variance: Array, noise: Array, lead: Array) -> tuple[Array, Array, Array]:
     """`_met` where nothing is unknown."""
     told = ~jnp.isinf(noise)
-    r = jnp.where(told, noise, 0)
-    gain = lead * variance
-    both = r + lead * gain
-    some = told & (both > 0)
-    share = jnp.where(some, 1 / jnp.where(some, both, 1), 0)
-    kept = jnp.where(some, r * share, 1)
-    return variance * kept, jnp.where(told, both, jnp.inf), gain * share
+    kept, both, step = _weighed(variance, jnp.where(told, noise, 0), lead)
+    return (
+        jnp.where(told, kept, variance),
+        jnp.where(told, both, jnp.inf),
+        jnp.where(told, step, 0),
+    )
+
+
+@jax.custom_jvp
+def _weighed(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array]:
+    """v r / S, S = r + lead^2 v and lead v / S; v, S and 0 where S is 0."""
+    S, _, a, b = _shares(v, r, lead)
+    return v * a, S, b
+
+
+@_weighed.defjvp
+def _weighed_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
+    # After a gap v is so large that 1 / S^2 is 0 to the machine: the chain rule then keeps the one
+    # of two terms that should cancel. Here no terms cancel.
+    (v, r, lead), (dv, dr, dlead) = primals, tangents
+    S, q, a, b = _shares(v, r, lead)
+    kept = a * (a * dv) + b * (b * dr) - 2 * (v * a) * (b * dlead)
+    both = dr + lead * (lead * dv) + 2 * (lead * v) * dlead
+    step = lead * (q * (a * dv)) - b * (q * dr) + (v * q) * ((a - lead * b) * dlead)
+    return (v * a, S, b), (kept, both, step)
+
+
+def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array]:
+    """S, 1 / S, r / S and lead v / S."""
+    S = r + lead * (lead * v)
+    some = S > 0
+    q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
+    return S, q, jnp.where(some, r * q, 1), lead * (v * q)
 
 
 def _turned(row: Array, rest: Array, lead: Array, step: Array) -> tuple[Array, Array]:
@@ -210,18 +238,15 @@ def _met(n: int) -> Callable[..., tuple[Array, ...]]:
         v, r = jnp.where(unknown, 0, variance), jnp.where(telling, noise, 0)
         rounding = 8 * n * float(jnp.finfo(lead.dtype).eps) * scale
         lead = jnp.where(unknown & (jnp.abs(lead) <= rounding), 0, lead)
-        both = r + lead * lead * v
-        some = telling & (both > 0)
-        share = jnp.where(some, 1 / jnp.where(some, both, 1), 0)
+        again, both, step = _weighed(v, r, lead)
         fresh = unknown & telling & (lead != 0)
         inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
         first = jnp.where(fresh, r * inverted * inverted, jnp.inf)
-        again = v * jnp.where(some, r * share, 1)
         return (
-            jnp.where(unknown, first, again),
+            jnp.where(unknown, first, jnp.where(telling, again, v)),
             jnp.where(fresh | ~telling, jnp.inf, both),
             lead,
-            jnp.where(unknown, inverted, lead * v * share),
+            jnp.where(unknown, inverted, jnp.where(telling, step, 0)),
         )
 
     return met

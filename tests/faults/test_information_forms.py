@@ -7,7 +7,7 @@ import pytest
 
 import ewif_jax as ej
 
-PRIOR = ej.Gaussian(np.zeros(2), np.eye(2))
+PRIOR = ej.Gaussian(jnp.zeros(2), jnp.eye(2))
 DATA = ej.stream(np.arange(3.0), np.array([5.0, 7.0, 9.0]))
 WEIGHT = lambda p, a, b: jnp.exp((a - b) / 4)  # noqa: E731
 
@@ -62,7 +62,7 @@ def test_information_after_a_gap_of_stable_motion_is_kalman(dtype, gap):
     )
     t = np.r_[np.arange(1.0, 6), gap + np.arange(1.0, 9)].astype(dtype)
     data = ej.stream(t, np.ones(t.size, dtype))
-    prior = ej.Gaussian(np.zeros(1, dtype), np.eye(1, dtype=dtype))
+    prior = ej.Gaussian(jnp.zeros(1, dtype), jnp.eye(1, dtype=dtype))
     kalman, form, ewif = (
         ej.run(f, None, data, prior=prior, t0=0.0)
         for f in (ej.kalman(stable), ej.information(stable), ej.ewif(stable, 2.0))
