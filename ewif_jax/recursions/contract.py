@@ -115,12 +115,13 @@ def estimator_from(recursion: Recursion) -> Estimator:
         present, late = jnp.any(measurement.mask), measurement.time < state.time
         accepted = changed = info.status != Status.REJECTED
         likelihood = jnp.where(accepted, info.log_likelihood, 0)
-        if not recursion.starts_from_nothing:
-            # Parameters outside of their domain make NaN of Q or R, and so of all that follows; a
-            # filter that starts from nothing says by NaN that nothing is known.
-            is_number = jnp.all(jnp.isfinite(info.innovation_cov))
-            likelihood = jnp.where(is_number, likelihood, -jnp.inf)
-            accepted, changed = accepted & is_number, accepted | ~is_number
+        # Parameters outside of their domain make NaN of Q or R, and so of all that follows. What
+        # starts from nothing also says by NaN that nothing is known; it refuses the former.
+        is_broken = ~jnp.all(jnp.isfinite(info.innovation_cov))
+        if recursion.starts_from_nothing:
+            is_broken &= ~accepted
+        likelihood = jnp.where(is_broken, -jnp.inf, likelihood)
+        accepted, changed = accepted & ~is_broken, accepted | is_broken
         used = jnp.where(late, Status.LATE_USED, Status.USED)
         status = jnp.where(accepted, used, Status.REJECTED)
         status = jnp.where(present, status, Status.MASKED).astype(jnp.int32)
