@@ -1,8 +1,9 @@
 """Two versions of the package in turns: ``python benchmarks/versus.py OTHER_CHECKOUT``.
 
 Each version runs in a process of its own, on the same seeded workloads; the two take turns call by
-call, so that what else the machine does falls on both alike. A ratio is the time of the other
-checkout over that of this one, per turn; its median is printed: above 1 this one is faster.
+call, so that what else the machine does falls on both alike; processor time hardly sees it. A ratio
+is the time of the other checkout over that of this one, per turn; its median is printed: above 1
+this one is faster.
 """
 
 import argparse
@@ -35,13 +36,19 @@ def main() -> None:
     names = both[1].ask("names")
     if options.rows:
         names = [name for name in names if any(part in name for part in options.rows)]
-    print(f"{'row':26s} {'other ms':>10s} {'this ms':>10s} {'ratio':>7s} {'first calls s':>16s}")
+    head = f"{'row':26s} {'other ms':>10s} {'this ms':>10s} {'ratio':>7s} {'of CPU':>7s}"
+    print(f"{head} {'first calls, CPU s':>22s}")
     for name in names:
-        first = [version.ask(name) for version in both]
+        first = [version.ask(name)[1] for version in both]
         turns = [[version.ask(name) for version in both] for _ in range(options.repeat)]
-        ratio = statistics.median(a / b for a, b in turns)
-        other, this = (1000 * statistics.median(x) for x in zip(*turns, strict=True))
-        print(f"{name:26s} {other:10.2f} {this:10.2f} {ratio:7.2f} {first[0]:8.2f}{first[1]:8.2f}")
+        wall, busy = ([[taken[k] for taken in turn] for turn in turns] for k in (0, 1))
+        ratios = [statistics.median(a / b for a, b in times) for times in (wall, busy)]
+        other, this = (1000 * statistics.median(x) for x in zip(*wall, strict=True))
+        print(
+            f"{name:26s} {other:10.2f} {this:10.2f} {ratios[0]:7.2f} {ratios[1]:7.2f}"
+            f" {first[0]:11.2f}{first[1]:11.2f}",
+            flush=True,
+        )
 
 
 class Version:
@@ -73,9 +80,10 @@ def answer_requests() -> None:
             continue
         import jax
 
-        begin = time.perf_counter()
+        begin, busy = time.perf_counter(), time.process_time()
         jax.block_until_ready(rows[name]())
-        print(json.dumps(time.perf_counter() - begin), flush=True)
+        taken = time.perf_counter() - begin, time.process_time() - busy
+        print(json.dumps(taken), flush=True)
 
 
 def workload_rows() -> dict[str, Call]:

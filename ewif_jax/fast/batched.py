@@ -53,6 +53,16 @@ def linear_kernel(fn: Function, adjoint: Function, cheap: bool = False) -> Funct
     return kernel(fn, cheap)
 
 
+def kept_apart(fn: Function) -> Function:
+    """`fn`, for `stage`: a function of its own in the program without a batch too.
+
+    Otherwise the compiler fuses a chain of stages into every number that is read at its end, and
+    computes and compiles the whole chain again for each of them.
+    """
+    _APART.add(fn)
+    return fn
+
+
 def total(terms: Iterable[Array]) -> Array:
     """The sum of at least one array."""
     return reduce(add, terms)
@@ -189,7 +199,7 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
 
         return jax.jvp(of, tuple(at), tuple(moved))[1]
 
-    return tangent
+    return kept_apart(tangent) if fn in _APART else tangent
 
 
 def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) -> Sequence[Any]:
@@ -231,7 +241,7 @@ def _adjoint(
         )
         return jax.linear_transpose(of, *unknown)(given)
 
-    return adjoint
+    return kept_apart(adjoint) if fn in _APART else adjoint
 
 
 def _merge(chosen: Sequence[bool], some: Sequence[Any], others: Sequence[Any]) -> list[Any]:

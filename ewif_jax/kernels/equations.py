@@ -11,14 +11,12 @@ Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax.fast.batched import kernel, stage, total
+from ewif_jax.fast.batched import kept_apart, kernel, stage, total
 from ewif_jax.fast.sparse import Pattern, by_row
 
 
@@ -139,49 +137,10 @@ def _times(rows: Array, x: Array) -> Array:
     )
 
 
-@kernel
-def _refined(
-    variances: Array, rows: Array, equation: Array, noise: Array
-) -> tuple[Array, Array, Array, Array]:
-    n, batch = equation.shape[0], equation.ndim - 1
-    found = []
-    for k, row in enumerate(_pieces(rows, n)):
-        lead = equation[0]
-        variance, noise, step = stage(_shared, variances[k], noise, lead, batch=batch)
-        if k < n - 1:
-            row, equation = stage(_turned, row, equation[1:], lead, step, batch=batch)
-        found.append((variance, row, lead, step))
-    return _together(found, rows)
-
-
-def _shared(variance: Array, noise: Array, lead: Array) -> tuple[Array, Array, Array]:
-    """`_met` where nothing is unknown."""
-    told = ~jnp.isinf(noise)
-    kept, both, step = _weighed(variance, jnp.where(told, noise, 0), lead)
-    return (
-        jnp.where(told, kept, variance),
-        jnp.where(told, both, jnp.inf),
-        jnp.where(told, step, 0),
-    )
-
-
-@jax.custom_jvp
 def _weighed(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array]:
     """v r / S, S = r + lead^2 v and lead v / S; v, S and 0 where S is 0."""
     S, _, a, b = _shares(v, r, lead)
     return v * a, S, b
-
-
-@_weighed.defjvp
-def _weighed_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
-    # After a gap v is so large that 1 / S^2 is 0 to the machine: the chain rule then keeps the one
-    # of two terms that should cancel. Here no terms cancel.
-    (v, r, lead), (dv, dr, dlead) = primals, tangents
-    S, q, a, b = _shares(v, r, lead)
-    kept = a * (a * dv) + b * (b * dr) - 2 * (v * a) * (b * dlead)
-    both = dr + lead * (lead * dv) + 2 * (lead * v) * dlead
-    step = lead * (q * (a * dv)) - b * (q * dr) + (v * q) * ((a - lead * b) * dlead)
-    return (v * a, S, b), (kept, both, step)
 
 
 def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array]:
@@ -190,11 +149,6 @@ def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array
     some = S > 0
     q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
     return S, q, jnp.where(some, r * q, 1), lead * (v * q)
-
-
-def _turned(row: Array, rest: Array, lead: Array, step: Array) -> tuple[Array, Array]:
-    rest = rest - lead[None] * row
-    return row + step[None] * rest, rest
 
 
 @kernel
@@ -249,9 +203,10 @@ def _met(n: int) -> Callable[..., tuple[Array, ...]]:
             jnp.where(unknown, inverted, jnp.where(telling, step, 0)),
         )
 
-    return met
+    return kept_apart(met)
 
 
+@kept_apart
 def _taken_out(
     row: Array, rest: Array, scale: Array, lead: Array, step: Array
 ) -> tuple[Array, Array, Array]:

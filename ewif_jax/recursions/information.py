@@ -257,14 +257,20 @@ def estimate(state: InformationState) -> Gaussian:
     )
 
 
+def largest_variance(dtype: Any) -> float:
+    """How large a variance may become. The derivative of an update divides by squares of variances:
+    they and their reciprocals have to be ordinary numbers."""
+    return float(jnp.finfo(dtype).max) ** 0.4
+
+
 def grown(variances: Array, growth: Array | float) -> Array:
-    """Variances times `growth`, but no larger than the root of the largest number.
+    """Variances times `growth`, but no larger than `largest_variance`.
 
     So what was known never becomes nothing, its derivatives stay finite, and the prediction after
     any gap is still one. What is infinite, or grows without bound at once, becomes infinite.
     """
     growth = jnp.asarray(growth, variances.dtype)
-    ceiling = float(np.sqrt(float(jnp.finfo(variances.dtype).max)))
+    ceiling = largest_variance(variances.dtype)
     fits = variances <= ceiling / growth
     larger = jnp.where(fits, variances, 0) * jnp.where(fits, growth, 1)
     larger = jnp.where(fits, larger, jnp.maximum(lax.stop_gradient(variances), ceiling))
@@ -272,9 +278,9 @@ def grown(variances: Array, growth: Array | float) -> Array:
 
 
 def exponential(age: Array, tau: Array) -> Array:
-    """exp(age / tau), saturated where its square would overflow (either way), with derivatives."""
+    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives."""
     dtype = jnp.result_type(age, tau)
-    most = 0.5 * float(np.log(float(jnp.finfo(dtype).max)))
+    most = float(np.log(largest_variance(dtype)))
     return jnp.exp(jnp.clip(age / tau, -most, most))
 
 
@@ -328,7 +334,7 @@ def refuse_one_way(model: Model, params: Any, method: str) -> None:
 
 def _reciprocal(x: Array) -> Array:
     """1 / x, saturated like `grown`."""
-    most = float(np.sqrt(float(jnp.finfo(x.dtype).max)))
+    most = largest_variance(x.dtype)
     usable = x > 1 / most
     return jnp.where(usable, 1 / jnp.where(usable, x, 1), jnp.where(jnp.isnan(x), x, most))
 
