@@ -46,7 +46,9 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
 
     def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> HistoryState:
         first = in_sequence.init(params, prior, t0, key)
-        return HistoryState(*first, jnp.asarray(False), copies(first, lag))
+        return HistoryState(
+            first.time, first.mean, first.cov, jnp.asarray(False), copies(first, lag)
+        )
 
     def move(params: Any, state: HistoryState, time: Array) -> HistoryState:
         now = CovarianceState(state.time, state.mean, state.cov)
@@ -54,7 +56,7 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
         left = time > state.time
         push = left & state.used
         past = jax.tree.map(lambda new, old: slots.pushed(new, old, push), now, state.past)
-        return HistoryState(*moved, state.used & ~left, past)
+        return HistoryState(time, moved.mean, moved.cov, state.used & ~left, past)
 
     def is_after_oldest(params: Any, state: HistoryState, time: Array) -> Array:
         del params
