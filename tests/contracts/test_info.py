@@ -27,6 +27,8 @@ LATE_AND_MASKED = 9
 NOT_A_NUMBER = (4, 7, 8, 10)
 TOO_LARGE = {np.float32: 1e20, np.float64: 1e200}
 """Numbers whose squares are not."""
+MOVES_ANEW = ("information", "drop_late")
+"""Whose equations are made triangular again by a move over no time, which rounds them."""
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
 
 
@@ -82,7 +84,10 @@ def test_what_is_not_used_says_so_alike(row, dtype):
         ahead = max(states[k].time, times[k]) if np.isfinite(times[k]) else np.nan
         delay = ahead - times[k] if np.isfinite(times[k]) else 0
         assert info.delay[k] == np.asarray(delay, dtype), k
-        assert identical(states[k + 1], states[k]), k
+        if k == BEFORE_T0 and row.name in MOVES_ANEW:
+            same(states[k + 1], states[k], *2 * [8 * np.finfo(dtype).eps])
+        else:
+            assert identical(states[k + 1], states[k]), k
 
 
 @each
