@@ -50,7 +50,8 @@ def square_root(model: Model) -> Estimator:
     def move(params: Any, state: RootState, time: Array) -> RootState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
-        return RootState(time, mean, root)
+        # Made triangular again it would be the same but for its rounding.
+        return RootState(time, mean, jnp.where(time > state.time, root, state.root))
 
     def measure(params: Any, state: RootState, measurement: Measurement) -> tuple[RootState, Info]:
         difference, H, R, mask = compared(model, params, state.mean, measurement)

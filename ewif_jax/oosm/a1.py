@@ -1,8 +1,8 @@
 """A1: the exact update with a measurement that is one lag late."""
 
 from ewif_jax.models import Model
-from ewif_jax.oosm.equivalent import noise_estimated
-from ewif_jax.oosm.history import one_step
+from ewif_jax.oosm.parts.equivalent import noise_estimated
+from ewif_jax.oosm.parts.history import one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
 

@@ -1,8 +1,8 @@
 """Al1: the one-step solution for a late measurement several lags old."""
 
 from ewif_jax.models import Model
-from ewif_jax.oosm.equivalent import noise_estimated
-from ewif_jax.oosm.history import one_step
+from ewif_jax.oosm.parts.equivalent import noise_estimated
+from ewif_jax.oosm.parts.history import one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
 

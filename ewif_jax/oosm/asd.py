@@ -12,12 +12,11 @@ from ewif_jax.fast import slots
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, gaussian, symmetric, window
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, patterns, predict_measurement, predict_state
-from ewif_jax.oosm.history import too_late
+from ewif_jax.models import Model, patterns, predict_state
 from ewif_jax.recipe import from_recipe
-from ewif_jax.recursions.contract import verdict
-from ewif_jax.recursions.innovations import Compared, sound
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.innovations import compared, info_of, sound
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 class WindowState(NamedTuple):
@@ -81,51 +80,39 @@ def asd(model: Model, lag: int) -> Estimator:
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     count = checks.whole("lag", lag, 1) + 1
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> WindowState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> WindowState:
         del key
-        prior = checks.needs_prior(prior, "asd")
-        checks.prior(prior)
-        mean = jnp.asarray(prior.mean)
-        cov = symmetric.pack(jnp.asarray(prior.cov, mean.dtype))
-        time, still = jnp.asarray(t0, mean.dtype), jnp.eye(mean.shape[0], dtype=mean.dtype)
+        mean, cov = prior.mean, symmetric.pack(prior.cov)
+        still = jnp.eye(mean.shape[0], dtype=mean.dtype)
         noise = jax.eval_shape(lambda: jnp.asarray(model.measurement_cov(params, np.int32(0), t0)))
         one = jnp.eye(noise.shape[0], dtype=mean.dtype)
         none = jnp.zeros((noise.shape[0], mean.shape[0]), mean.dtype)
-        first = window.Kept(time, mean, cov, still, none, one, none.T, one, none[:, 0])
-        kept = copies(first, count)
-        return WindowState(time, mean, cov, still, kept)
+        first = window.Kept(t0, mean, cov, still, none, one, none.T, one, none[:, 0])
+        return WindowState(t0, mean, cov, still, copies(first, count))
 
-    def predict(params: Any, state: WindowState, time: Array) -> WindowState:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        mean, F, Q = predict_state(model, params, state.mean, state.time, ahead)
-        known = time >= state.time
-        cov = symmetric.propagated(F, state.cov, symmetric.pack(Q), known, patterns(model)[0])
-        mean = jnp.where(known, mean, jnp.nan)
+    def move(params: Any, state: WindowState, time: Array) -> WindowState:
+        mean, F, Q = predict_state(model, params, state.mean, state.time, time)
+        cov = symmetric.congruence(F, state.cov, patterns(model)[0]) + symmetric.pack(Q)
         return state._replace(time=time, mean=mean, cov=cov, F=matmul(F, state.F))
 
-    def update(
+    def is_after_oldest(params: Any, state: WindowState, time: Array) -> Array:
+        del params
+        return time >= state.kept.time[0]
+
+    def measure(
         params: Any, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
-        late, present = measurement.time < state.time, jnp.any(measurement.mask)
         place = jnp.sum(state.kept.time <= measurement.time)
-        known = place > 0
-        usable = known & present
         mean, cov, before, after = _split(model, params, state, measurement.time, place)
         first = jnp.arange(count) == place
 
-        at = mean
+        linearised_at = mean
         if model.linear is None:
-            at = mean + symmetric.times(cov, window.force(state.kept, first, after))
-        predicted, H, R = predict_measurement(
-            model, params, at, measurement.sensor, measurement.time
-        )
-        checks.shape("measurement.value", measurement.value, (H.shape[0],))
-        difference = model.residual(measurement.value, predicted, measurement.sensor)
-        seen = Compared(difference, H, R, measurement.mask & known)
-        (difference, H, R, mask), good = sound(model, cov, seen)
+            linearised_at = mean + symmetric.times(cov, window.force(state.kept, first, after))
+        seen = compared(model, params, linearised_at, measurement)
+        (difference, H, R, mask), accepted = sound(model, cov, seen)
         H, R = jnp.where(mask[:, None], H, 0), gaussian.mask_cov(R, mask)
-        difference = jnp.where(mask, difference + matvec(H, at - mean), 0)
+        difference = jnp.where(mask, difference + matvec(H, linearised_at - mean), 0)
 
         cross = symmetric.rows(H, cov).T
         entry = matmul(after, cross)
@@ -133,33 +120,30 @@ def asd(model: Model, lag: int) -> Estimator:
         D = matmul(state.F, passed.D[-1]) + jnp.where(place == count, entry, 0)
         U, nu = passed.U[-1], passed.nu[-1]
         whole = gaussian.innovate(nu, D.T, U + R, mask)
-        info = Info(
-            whole.value,
-            whole.cov,
-            gaussian.log_density(whole, mask),
-            state.time - measurement.time,
-            verdict(late, present, Status.LATE_USED, good),
-        )
         if state.share is not None:
             R = R + _excess(state.share) * jnp.where(mask[:, None] & mask[None, :], whole.cov, 0)
         now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask)[:2]
         mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
         weight, pull, gain = _solved(innovation)
         new = window.Kept(measurement.time, mean, cov, after, H, R, gain, weight, pull)
-        mean, cov = choose(late, now, (mean, cov))
+        mean, cov = choose(measurement.time < state.time, now, (mean, cov))
+        used = jnp.any(mask)
         updated = state._replace(
             mean=mean,
             cov=cov,
-            F=jnp.where(usable & (place == count), after, state.F),
-            kept=window.inserted(new, before, state.kept, passed, R, jnp.where(usable, place, 0)),
+            F=jnp.where(used & (place == count), after, state.F),
+            kept=window.inserted(new, before, state.kept, passed, R, jnp.where(used, place, 0)),
         )
-        return choose(usable & good, updated, state), too_late(info, ~known)
+        return updated, info_of(whole, mask, accepted)
 
     def estimate(params: Any, state: WindowState) -> Gaussian:
         del params
         return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
-    return Estimator(init, predict, update, estimate, model=model)
+    # What is masked has H = 0 and corrects nothing: every number of the state stays.
+    return estimator_from(
+        Recursion("asd", start, move, measure, estimate, is_after_oldest, keeps=True, model=model)
+    )
 
 
 def _split(

@@ -4,8 +4,8 @@ from functools import partial
 
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import need_reversible
-from ewif_jax.oosm.equivalent import moved_back
-from ewif_jax.oosm.history import one_step
+from ewif_jax.oosm.parts.equivalent import moved_back
+from ewif_jax.oosm.parts.history import one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Estimator
 

@@ -12,7 +12,7 @@ from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model, predict_measurement
-from ewif_jax.oosm.history import last_before
+from ewif_jax.oosm.parts.history import last_before
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing

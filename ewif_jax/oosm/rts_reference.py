@@ -5,17 +5,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models import Model, patterns, predict_measurement, predict_state
-from ewif_jax.oosm.equivalent import noise_estimated
-from ewif_jax.oosm.history import HistoryState, last_before, one_step, taken
+from ewif_jax.models import Model, patterns, predict_state
+from ewif_jax.oosm.parts.history import HistoryState, one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
-from ewif_jax.recursions.innovations import Compared, updated
-from ewif_jax.types import Estimator, Info, Measurement
+from ewif_jax.recursions.innovations import Compared, compared
+from ewif_jax.types import Estimator, Measurement
 
 
 class Tie(NamedTuple):
@@ -65,25 +63,18 @@ def rts_reference(model: Model, lag: int) -> Estimator:
     Raises:
         ValueError: lag < 1; `init` with `prior=None`.
     """
-    form = one_step(model, "rts_reference", lag, noise_estimated)
+    return one_step(model, "rts_reference", lag, smoothed_back)
 
-    def update(
-        params: Any, state: HistoryState, measurement: Measurement
-    ) -> tuple[HistoryState, Info]:
-        known, start = last_before(state.past, measurement.time)
-        at = jnp.clip(measurement.time, start.time, state.time)
-        tie = _tied(model, params, state, start, at)
-        predicted, H, R = predict_measurement(
-            model, params, tie.mean, measurement.sensor, measurement.time
-        )
-        checks.shape("measurement.value", measurement.value, (H.shape[0],))
-        R = R + matmul(matmul(H, symmetric.unpack(tie.cov)), H.T)
-        difference = model.residual(measurement.value, predicted, measurement.sensor)
-        seen = Compared(difference, matmul(H, tie.A), R, measurement.mask)
-        mean, cov, info = updated(model, state.mean, state.cov, seen)
-        return taken(state, mean, cov, measurement, known, info)
 
-    return form._replace(update=update)
+def smoothed_back(
+    model: Model, params: Any, state: HistoryState, start: CovarianceState, measurement: Measurement
+) -> tuple[Compared, bool]:
+    """The measurement through the smoothed state of its time; it can always be used."""
+    time = jnp.clip(measurement.time, start.time, state.time)
+    tie = _tied(model, params, state, start, time)
+    seen = compared(model, params, tie.mean, measurement)
+    R = seen.R + matmul(matmul(seen.H, symmetric.unpack(tie.cov)), seen.H.T)
+    return seen._replace(H=matmul(seen.H, tie.A), R=R), True
 
 
 def _tied(

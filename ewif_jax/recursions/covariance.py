@@ -26,6 +26,13 @@ class CovarianceState(NamedTuple):
 def covariance_form(
     model: Model, method: str, inflation: Callable[..., Array] | None = None
 ) -> Estimator:
+    """The estimator of `covariance_recursion`."""
+    return estimator_from(covariance_recursion(model, method, inflation))
+
+
+def covariance_recursion(
+    model: Model, method: str, inflation: Callable[..., Array] | None = None
+) -> Recursion:
     """The Kalman recursion with the model's matrices, or with its Jacobians at the mean.
 
     `inflation(params, t0, t1)` multiplies F P F' before Q is added. Over one interval it is at most
@@ -58,9 +65,7 @@ def covariance_form(
         del params
         return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
-    return estimator_from(
-        Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)
-    )
+    return Recursion(method, start, move, measure_now, estimate, keeps=True, model=model)
 
 
 def measure(

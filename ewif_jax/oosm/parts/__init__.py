@@ -1,0 +1,1 @@
+"""What only the methods for late measurements share."""
