@@ -41,8 +41,8 @@ def ensemble(
     The innovation :math:`\nu` of the mean goes through `model.residual` once, so that an angle far
     from its prediction turns all members the same way; means of angles are relative to the
     measurement predicted at the mean. Late measurements, masks and singular Q, P and R as in
-    `kalman`. The members are functions of `params` and of fixed random numbers, so gradients are
-    those of one realisation.
+    `kalman`; what all members predict alike, to rounding, tells them nothing. The members are
+    functions of `params` and of fixed random numbers, so gradients are those of one realisation.
 
     Args:
         model: linear or not; no derivative of it is needed.

@@ -61,7 +61,7 @@ def pf_extended(
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. Q may be
-            singular; R must be positive definite.
+            singular; R must be positive definite (else every measurement is `REJECTED`).
         particles: N >= 2.
         lag: how many past times are stored, >= 1; each takes n N numbers. A measurement older than
             all of them, or than t0, is `TOO_LATE`. Times without a used measurement are not stored.

@@ -70,8 +70,9 @@ def pf_fixed_point(
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. R must be
-            positive definite, and for "ps" Q too (a singular Q has no density: every late
-            measurement is then `REJECTED`).
+            positive definite (else every measurement in sequence is `REJECTED`, and with "ps" every
+            late one), and for "ps" Q too (a singular Q has no density: every late measurement is
+            then `REJECTED`).
         particles: N >= 2.
         lag: how many in-sequence measurements are stored, >= 1, each with the mean and covariance
             after it: what the state holds does not grow with lag times N. A measurement older than

@@ -39,7 +39,8 @@ def pf_retrodict(
 
     Args:
         model: linear or not; it must allow motion back in time, and its process noise must compose
-            over parts of an interval. R must be positive definite.
+            over parts of an interval. R must be positive definite (else every measurement is
+            `REJECTED`).
         particles: N >= 2.
         resampling, ess_threshold: as in `bootstrap`.
         collapse: a late measurement that divides the effective sample size by more than this is

@@ -118,6 +118,11 @@ def look(model: Model, params: Any, members: Array, there: Array, measurement: M
     shift = mean_of(offsets)
     every_offset = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
     deviations = jnp.where(mask[:, None] & every_offset, offsets - shift[:, None], 0)
+    # After an exact measurement members differ by rounding only, which would be weighed like
+    # knowledge by the next one: a component without noise would divide by it.
+    rounding = 8 * jnp.finfo(origin.dtype).eps * jnp.abs(origin)
+    apart = jnp.max(jnp.abs(deviations), 1) > rounding
+    deviations = jnp.where(apart[:, None], deviations, 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
     cov = spread(deviations) + R
     all_finite = every_offset & numbers(difference, cov, mask)
