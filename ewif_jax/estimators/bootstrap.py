@@ -2,11 +2,14 @@
 
 from typing import Any
 
+from jax import Array
+
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -67,16 +70,16 @@ def bootstrap(
     """
     kind = form.cloud(model, particles, resampling, ess_threshold)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ParticleState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
-        return form.draw(kind, "bootstrap", prior, t0, key)
+        return form.drawn(kind, prior, t0, key)
 
-    def update(
+    def measure(
         params: Any, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
-        in_sequence = weighing.within_reach(measurement, measurement.time >= state.time)
-        seen = weighing.look(model, params, state.particles, state.log_weights, in_sequence)
-        log_weights, info = weighing.weigh(state, seen, measurement, reachable=False)
+        seen = weighing.look(model, params, state.particles, state.log_weights, measurement)
+        log_weights, info = weighing.weigh(state, seen, measurement)
         return state._replace(log_weights=log_weights), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
+    recursion = Recursion("bootstrap", start, form.mover(kind), measure, form.estimate, model=model)
+    return estimator_from(recursion._replace(draws=True, estimated=("particles",)))

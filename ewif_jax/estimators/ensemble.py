@@ -2,16 +2,15 @@
 
 from typing import Any, Literal
 
-import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import ensembles
-from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.ensembles import EnsembleState
+from ewif_jax.recursions.innovations import info_of
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 FORMS = ("stochastic", "square_root")
@@ -42,8 +41,8 @@ def ensemble(
     The innovation :math:`\nu` of the mean goes through `model.residual` once, so that an angle far
     from its prediction turns all members the same way; means of angles are relative to the
     measurement predicted at the mean. Late measurements, masks and singular Q, P and R as in
-    `kalman`. The members are functions of `params` and of fixed random numbers, so gradients are
-    those of one realisation.
+    `kalman`; what all members predict alike, to rounding, tells them nothing. The members are
+    functions of `params` and of fixed random numbers, so gradients are those of one realisation.
 
     Args:
         model: linear or not; no derivative of it is needed.
@@ -65,36 +64,28 @@ def ensemble(
     count = checks.whole("members", members, 2)
     checks.require(form in FORMS, "form", f"one of {FORMS}", repr(form))
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> EnsembleState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> EnsembleState:
         del params
-        return ensembles.start(prior, t0, key, count, "ensemble")
+        return ensembles.drawn(prior, t0, key, count)
 
-    def predict(params: Any, state: EnsembleState, time: Array) -> EnsembleState:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        moved, _ = ensembles.moved(model, params, state, ahead)
-        shown = jnp.where(time >= state.time, moved.members, jnp.nan)
-        return moved._replace(time=time, members=shown)
+    def move(params: Any, state: EnsembleState, time: Array) -> EnsembleState:
+        return ensembles.moved(model, params, state, time)[0]
 
-    def update(
+    def measure(
         params: Any, state: EnsembleState, measurement: Measurement
     ) -> tuple[EnsembleState, Info]:
-        late, present = measurement.time < state.time, jnp.any(measurement.mask)
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
-        in_sequence = measurement._replace(mask=measurement.mask & ~late)
-        looked = ensembles.look(model, params, state.members, state.members, in_sequence)
-        used = present & ~late & looked.good
+        looked = ensembles.look(model, params, state.members, state.members, measurement)
         if form == "stochastic":
-            updated = ensembles.perturbed(state.members, looked, own)
+            members = ensembles.perturbed(state.members, looked, own)
         else:
-            updated = ensembles.transformed(state.members, looked)
-        delay = state.time - measurement.time
-        status = verdict(late, present, good=looked.good)
-        info = ensembles.info_of(looked, delay, used, status)
-        return choose(used, state._replace(members=updated, sight=sight), state), info
+            members = ensembles.transformed(state.members, looked)
+        info = info_of(looked.innovation, looked.mask, looked.all_finite)
+        return state._replace(members=members, sight=sight), info
 
     def estimate(params: Any, state: EnsembleState) -> Gaussian:
         del params
         return ensembles.moments(state.members)
 
-    return Estimator(init, predict, update, estimate, model=model)
+    recursion = Recursion("ensemble", start, move, measure, estimate, model=model)
+    return estimator_from(recursion._replace(draws=True, estimated=("members",)))

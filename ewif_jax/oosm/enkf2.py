@@ -57,7 +57,7 @@ def enkf2(
     def retrodict(
         params: Any, state: EnsembleHistory, bracket: Bracket, time: Array, key: Array
     ) -> Array:
-        there, ahead, now = bracket.there, bracket.ahead, state.now.members
+        there, ahead, now = bracket.there, bracket.ahead, state.members
         if ahead is None:
             drawn = ensembles.process_noise(model, params, key, there, time, state.time)
             ahead = ensembles.carried(model, params, there, time, state.time) + drawn

@@ -10,11 +10,12 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matvec
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.trees import choose, copies
+from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, predict_state
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -60,7 +61,7 @@ def pf_extended(
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. Q may be
-            singular; R must be positive definite.
+            singular; R must be positive definite (else every measurement is `REJECTED`).
         particles: N >= 2.
         lag: how many past times are stored, >= 1; each takes n N numbers. A measurement older than
             all of them, or than t0, is `TOO_LATE`. Times without a used measurement are not stored.
@@ -85,50 +86,53 @@ def pf_extended(
     collapse = form.collapse_factor(collapse)
     lag = checks.whole("lag", lag, 1)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> PathState:
+    in_order = jnp.arange(kind.particles, dtype=jnp.int32)
+
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> PathState:
         del params
-        first = form.draw(kind, "pf_extended", prior, t0, key)
+        first = form.drawn(kind, prior, t0, key)
         times, past = copies((first.time, first.particles), lag)
         return PathState(*first, jnp.asarray(False), times, past)
 
-    def predict(params: Any, state: PathState, time: Array) -> PathState:
-        time = jnp.asarray(time, state.time.dtype)
-
-        def go(state: PathState) -> PathState:
-            paths = jnp.concatenate([state.particles[None], state.past])
-            left = state.time
-            state, paths = form.step_ahead(kind, params, state, time, paths)
-            times = jnp.concatenate([left[None], state.past_times])
+    def move(params: Any, state: PathState, time: Array) -> PathState:
+        def go(old: PathState) -> PathState:
+            paths = jnp.concatenate([old.particles[None], old.past])
+            new, paths = form.step_ahead(kind, params, old, time, paths)
+            times = jnp.concatenate([old.time[None], old.past_times])
             kept = (times[:-1], paths[:-1]), (times[1:], paths[1:])
-            times, past = jax.tree.map(lambda a, b: jnp.where(state.used, a, b), *kept)
-            return state._replace(used=jnp.asarray(False), past_times=times, past=past)
+            times, past = jax.tree.map(lambda a, b: jnp.where(old.used, a, b), *kept)
+            return new._replace(used=jnp.asarray(False), past_times=times, past=past)
 
-        return form.leave(state, time, go)
+        return form.if_later(state, time, go)
 
-    def update(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
-        in_order, before = jnp.arange(particles, dtype=jnp.int32), ParticleState(*state[:4])
+    def within_lag(params: Any, state: PathState, time: Array) -> Array:
+        del params
+        return time >= state.past_times[-1]
 
+    def measure(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
         def drawn_between(cloud: ParticleState) -> tuple[ParticleState, Array, Array]:
             cloud, order, key = form.ready_to_draw(kind, cloud, in_order)
             ends = state._replace(particles=cloud.particles)
             return cloud, _between(model, params, ends, order, measurement.time, key), order
 
-        within_lag = measurement.time >= state.past_times[-1]
-        reached = weighing.within_reach(measurement, within_lag)
-        late = (measurement.time < state.time) & jnp.any(reached.mask)
-        drawn, there, order = lax.cond(
-            late, drawn_between, lambda cloud: (cloud, cloud.particles, in_order), before
+        cloud, there, order = lax.cond(
+            weighing.is_late(state, measurement),
+            drawn_between,
+            lambda cloud: (cloud, cloud.particles, in_order),
+            ParticleState(*state[:4]),
         )
-        seen = weighing.look(model, params, there, drawn.log_weights, reached)
-        log_weights, info = weighing.weigh(drawn, seen, measurement, within_lag, collapse)
-        used = weighing.was_used(info)
-        cloud = choose(used, drawn._replace(log_weights=log_weights), before)
+        seen = weighing.look(model, params, there, cloud.log_weights, measurement)
+        log_weights, info = weighing.weigh(cloud, seen, measurement, collapse)
+        cloud = cloud._replace(log_weights=log_weights)
         # The paths follow at the end, so that no branch has to copy them.
-        follow = late & used & jnp.any(order != in_order)
-        past = lax.cond(follow, lambda x: x[..., order], lambda x: x, state.past)
-        return state._replace(**cloud._asdict(), used=state.used | used, past=past), info
+        past = lax.cond(
+            jnp.any(order != in_order), lambda x: x[..., order], lambda x: x, state.past
+        )
+        return state._replace(**cloud._asdict(), used=jnp.asarray(True), past=past), info
 
-    return Estimator(init, predict, update, form.estimate, model=model)
+    recursion = Recursion("pf_extended", start, move, measure, form.estimate, within_lag)
+    recursion = recursion._replace(draws=True, estimated=("particles",))
+    return estimator_from(recursion._replace(model=model))
 
 
 def _between(

@@ -16,6 +16,7 @@ from ewif_jax.oosm.parts.history import last_before
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.fixed_point import Conditional, fixed_point, given
 from ewif_jax.recursions.innovations import numbers
@@ -69,8 +70,9 @@ def pf_fixed_point(
 
     Args:
         model: linear or not; its process noise must compose over parts of an interval. R must be
-            positive definite, and for "ps" Q too (a singular Q has no density: every late
-            measurement is then `REJECTED`).
+            positive definite (else every measurement in sequence is `REJECTED`, and with "ps" every
+            late one), and for "ps" Q too (a singular Q has no density: every late measurement is
+            then `REJECTED`).
         particles: N >= 2.
         lag: how many in-sequence measurements are stored, >= 1, each with the mean and covariance
             after it: what the state holds does not grow with lag times N. A measurement older than
@@ -110,48 +112,49 @@ def pf_fixed_point(
     few = checks.whole("smoother_particles", few, 2)
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if smoother == "uks" else None
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> SummaryState:
-        first = form.draw(kind, "pf_fixed_point", prior, t0, key)
-        assert prior is not None
-        dtype = first.time.dtype
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> SummaryState:
+        first = form.drawn(kind, prior, t0, key)
         if points is not None:
-            transform(points, params, 2 * first.particles.shape[0], dtype)
-        cov = symmetric.pack(jnp.asarray(prior.cov, dtype))
-        told = CovarianceState(first.time, jnp.asarray(prior.mean), cov)
+            transform(points, params, 2 * prior.mean.shape[0], t0.dtype)
+        told = CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
         m = _size(model, params, told)
         nothing = Measurement(
-            first.time, jnp.zeros(m, dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
+            t0, jnp.zeros(m, t0.dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
         )
         past, measured = copies((told, nothing), slots)
         return SummaryState(*first, past, measured)
 
-    def update(
+    def within_lag(params: Any, state: SummaryState, time: Array) -> Array:
+        del params
+        return time >= state.past.time[-1]
+
+    def measure(
         params: Any, state: SummaryState, measurement: Measurement
     ) -> tuple[SummaryState, Info]:
-        within_lag, start = last_before(state.past, measurement.time)
-        reached = weighing.within_reach(measurement, within_lag)
-        late = (measurement.time < state.time) & jnp.any(reached.mask)
-        tau = jnp.clip(measurement.time, start.time, state.time)
-
         def in_sequence(state: SummaryState) -> tuple[Seen, Array]:
             weights = state.log_weights
-            return weighing.look(model, params, state.particles, weights, reached), state.key
+            return weighing.look(model, params, state.particles, weights, measurement), state.key
 
         def smoothed(state: SummaryState) -> tuple[Seen, Array]:
             key, ours = jax.random.split(state.key)
             stored = jax.tree.map(lambda x: x[::-1], state.measured)
+            _, first = last_before(state.past, measurement.time)
+            tau = jnp.clip(measurement.time, first.time, state.time)
             if smoother == "ps":
-                last = lines(model, params, start, tau, stored, state.time, few, ours)
-                return look_back(model, params, last, state.time, state, reached), key
-            past = fixed_point(model, points, params, start, tau, stored, state.time)
-            return _look_through(model, params, past, state, reached), key
+                last = lines(model, params, first, tau, stored, state.time, few, ours)
+                return look_back(model, params, last, state.time, state, measurement), key
+            past = fixed_point(model, points, params, first, tau, stored, state.time)
+            return _look_through(model, params, past, state, measurement), key
 
-        seen, key = lax.cond(late, smoothed, in_sequence, state)
-        log_weights, info = weighing.weigh(state, seen, measurement, within_lag, collapse)
+        is_late = weighing.is_late(state, measurement)
+        seen, key = lax.cond(is_late, smoothed, in_sequence, state)
+        log_weights, info = weighing.weigh(state, seen, measurement, collapse)
         weighed = state._replace(log_weights=log_weights, key=key)
-        return choose(weighing.was_used(info), _remembered(weighed, measurement), state), info
+        return _remembered(weighed, measurement), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
+    recursion = Recursion("pf_fixed_point", start, form.mover(kind), measure, form.estimate)
+    recursion = recursion._replace(reach=within_lag, draws=True, estimated=("particles",))
+    return estimator_from(recursion._replace(model=model))
 
 
 def _size(model: Model, params: Any, at: CovarianceState) -> int:

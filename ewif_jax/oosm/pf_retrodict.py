@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax.kernels.resampling import Resampling
-from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
@@ -39,7 +39,8 @@ def pf_retrodict(
 
     Args:
         model: linear or not; it must allow motion back in time, and its process noise must compose
-            over parts of an interval. R must be positive definite.
+            over parts of an interval. R must be positive definite (else every measurement is
+            `REJECTED`).
         particles: N >= 2.
         resampling, ess_threshold: as in `bootstrap`.
         collapse: a late measurement that divides the effective sample size by more than this is
@@ -60,11 +61,15 @@ def pf_retrodict(
     kind = form.cloud(model, particles, resampling, ess_threshold)
     collapse = form.collapse_factor(collapse)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> ParticleState:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
-        return form.draw(kind, "pf_retrodict", prior, t0, key)
+        return form.drawn(kind, prior, t0, key)
 
-    def update(
+    def any_age(params: Any, state: ParticleState, time: Array) -> Array:
+        del params, state, time
+        return jnp.asarray(True)
+
+    def measure(
         params: Any, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
         def moved_back(state: ParticleState) -> tuple[ParticleState, Array]:
@@ -74,11 +79,12 @@ def pf_retrodict(
             origin = state.particles - form.noise(key, Q, particles)
             return state, form.transported(model, params, origin, state.time, then)
 
-        late = (measurement.time < state.time) & jnp.any(measurement.mask)
-        drawn, there = lax.cond(late, moved_back, lambda s: (s, s.particles), state)
+        is_late = weighing.is_late(state, measurement)
+        drawn, there = lax.cond(is_late, moved_back, lambda s: (s, s.particles), state)
         seen = weighing.look(model, params, there, drawn.log_weights, measurement)
-        log_weights, info = weighing.weigh(drawn, seen, measurement, True, collapse)
-        updated = drawn._replace(log_weights=log_weights)
-        return choose(weighing.was_used(info), updated, state), info
+        log_weights, info = weighing.weigh(drawn, seen, measurement, collapse)
+        return drawn._replace(log_weights=log_weights), info
 
-    return Estimator(init, form.predictor(kind), update, form.estimate, model=model)
+    recursion = Recursion("pf_retrodict", start, form.mover(kind), measure, form.estimate)
+    recursion = recursion._replace(reach=any_age, draws=True, estimated=("particles",))
+    return estimator_from(recursion._replace(model=model))

@@ -11,8 +11,10 @@ from ewif_jax import checks
 from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model
 from ewif_jax.recursions import ensembles
-from ewif_jax.recursions.contract import verdict
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.ensembles import EnsembleState
+from ewif_jax.recursions.innovations import info_of
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 class Slots(NamedTuple):
@@ -25,10 +27,12 @@ class Slots(NamedTuple):
 
 
 class EnsembleHistory(NamedTuple):
-    """now: time, members and keys; used (): whether this time has taken a measurement; past."""
+    """The fields of `EnsembleState`; used (): whether this time has taken a measurement; past."""
 
     time: Array
-    now: ensembles.EnsembleState
+    members: Array
+    key: Array
+    sight: Array
     used: Array
     past: Slots
 
@@ -58,71 +62,69 @@ def delayed(
     count = checks.whole("members", members, 2)
     lag = checks.whole("lag", lag, 1)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> EnsembleHistory:
+    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> EnsembleHistory:
         del params
-        now = ensembles.start(prior, t0, key, count, method)
-        times, stored = copies((now.time, now.members), lag)
+        first = ensembles.drawn(prior, t0, key, count)
+        times, stored = copies((first.time, first.members), lag)
         past = Slots(times, stored, stored if forecasts else None)
-        return EnsembleHistory(now.time, now, jnp.asarray(False), past)
+        return EnsembleHistory(*first, jnp.asarray(False), past)
 
-    def predict(params: Any, state: EnsembleHistory, time: Array) -> EnsembleHistory:
-        time = jnp.asarray(time, state.time.dtype)
-        ahead = jnp.maximum(time, state.time)
-        now, met = ensembles.moved(model, params, state.now, ahead)
+    def move(params: Any, state: EnsembleHistory, time: Array) -> EnsembleHistory:
+        now, noise_met = ensembles.moved(model, params, present(state), time)
         past = state.past
         if past.ahead is not None:
 
             def carried(x: Array) -> Array:
-                return ensembles.carried(model, params, x, state.time, ahead) + met
+                return ensembles.carried(model, params, x, state.time, time) + noise_met
 
             past = past._replace(ahead=jax.vmap(carried)(past.ahead))
-        past = choose(state.used, _pushed(past, state.now, now), past)
-        left = EnsembleHistory(ahead, now, jnp.asarray(False), past)
-        moved = choose(ahead > state.time, left, state)
-        shown = jnp.where(time >= state.time, moved.now.members, jnp.nan)
-        return moved._replace(time=time, now=moved.now._replace(time=time, members=shown))
+        past = choose(state.used, _pushed(past, state, now.members), past)
+        left = EnsembleHistory(*now, jnp.asarray(False), past)
+        return choose(time > state.time, left, state)
 
-    def update(
+    def within_lag(params: Any, state: EnsembleHistory, time: Array) -> Array:
+        del params
+        return time >= state.past.time[-1]
+
+    def measure(
         params: Any, state: EnsembleHistory, measurement: Measurement
     ) -> tuple[EnsembleHistory, Info]:
-        time, now = measurement.time, state.now
-        late, present = time < state.time, jnp.any(measurement.mask)
-        newer = jnp.sum(state.past.time > time)
-        within_lag = newer < lag
-        reached = measurement._replace(mask=measurement.mask & within_lag)
-        own, sight = ensembles.sight_keys(now.sight, measurement.sensor)
-        motion = ensembles.back_key(now.sight)
-        bracket = _interpolated(state, jnp.minimum(newer, lag - 1), time)
-        there = retrodict(params, state, bracket, jnp.minimum(time, state.time), motion)
-        there = jnp.where(late, there, now.members)
-        looked = ensembles.look(model, params, now.members, there, reached)
-        updated = ensembles.perturbed(now.members, looked, own)
-        used = within_lag & present & looked.good
-        late_status = jnp.where(within_lag, Status.LATE_USED, Status.TOO_LATE)
-        status = verdict(late, present, late_status, looked.good)
-        info = ensembles.info_of(looked, state.time - time, used, status)
-        taken = state._replace(
-            now=now._replace(members=updated, sight=sight), used=jnp.asarray(True)
+        own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
+        then = jnp.minimum(measurement.time, state.time)
+        there = retrodict(
+            params, state, _interpolated(state, then), then, ensembles.back_key(state.sight)
         )
-        return choose(used, taken, state), info
+        # Nothing was learned since "now", and a regression on rounding would move the members.
+        there = jnp.where(then < state.time, there, state.members)
+        looked = ensembles.look(model, params, state.members, there, measurement)
+        members = ensembles.perturbed(state.members, looked, own)
+        info = info_of(looked.innovation, looked.mask, looked.all_finite)
+        return state._replace(members=members, sight=sight, used=jnp.asarray(True)), info
 
     def estimate(params: Any, state: EnsembleHistory) -> Gaussian:
         del params
-        return ensembles.moments(state.now.members)
+        return ensembles.moments(state.members)
 
-    return Estimator(init, predict, update, estimate, model=model)
+    recursion = Recursion(method, start, move, measure, estimate, within_lag, model=model)
+    return estimator_from(recursion._replace(draws=True, estimated=("members",)))
 
 
-def _pushed(past: Slots, left: ensembles.EnsembleState, now: ensembles.EnsembleState) -> Slots:
-    """The slots with the ensemble that was left in front; its forecast is the one that moved."""
-    entry = Slots(left.time, left.members, None if past.ahead is None else now.members)
+def present(state: EnsembleHistory) -> EnsembleState:
+    """The ensemble now, without its past."""
+    return EnsembleState(*state[:4])
+
+
+def _pushed(past: Slots, left: EnsembleHistory, now: Array) -> Slots:
+    """The slots with the ensemble that was left in front; its forecast is what it became, `now`."""
+    entry = Slots(left.time, left.members, None if past.ahead is None else now)
     return jax.tree.map(lambda new, old: jnp.concatenate([new[None], old[:-1]]), entry, past)
 
 
-def _interpolated(state: EnsembleHistory, newer: Array, time: Array) -> Bracket:
+def _interpolated(state: EnsembleHistory, time: Array) -> Bracket:
     """Eq. (26) between the newest entry not newer than `time` and the next one, which may be now;
     forecasts likewise."""
-    past, now = state.past, state.now
+    past = state.past
+    newer = jnp.minimum(jnp.sum(past.time > time), past.time.shape[0] - 1)
     after = jnp.maximum(newer - 1, 0)
     last = newer == 0
     start = past.time[newer]
@@ -132,7 +134,7 @@ def _interpolated(state: EnsembleHistory, newer: Array, time: Array) -> Bracket:
     share = jnp.clip(share, 0, 1)
 
     def between(table: Array) -> Array:
-        newest = jnp.where(last, now.members, table[after])
+        newest = jnp.where(last, state.members, table[after])
         return (1 - share) * table[newer] + share * newest
 
     ahead = None if past.ahead is None else between(past.ahead)

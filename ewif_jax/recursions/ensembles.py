@@ -14,7 +14,7 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model
 from ewif_jax.recursions.innovations import numbers
 from ewif_jax.recursions.sigma_points import view
-from ewif_jax.types import Gaussian, Info, Measurement
+from ewif_jax.types import Gaussian, Measurement
 
 
 class EnsembleState(NamedTuple):
@@ -30,24 +30,20 @@ class EnsembleState(NamedTuple):
 class Look(NamedTuple):
     """What an ensemble makes of a measurement: deviations (m, N) of what its members predict from
     their mean, the noise root G (m, m) with R = G G', the innovation, and mask (m,) of what is
-    used: nothing if innovation or log density are not finite (good () is False then)."""
+    used: nothing if innovation or covariance are not finite (all_finite () is False then)."""
 
     deviations: Array
     noise: Array
     innovation: gaussian.Innovation
     mask: Array
-    good: Array
+    all_finite: Array
 
 
-def start(prior: Gaussian | None, t0: Any, key: Any, count: int, method: str) -> EnsembleState:
+def drawn(prior: Gaussian, t0: Array, key: Array, count: int) -> EnsembleState:
     """`count` members drawn from the prior."""
-    prior = checks.needs_prior(prior, method)
-    checks.prior(prior)
-    own, path, sight = jax.random.split(checks.needs_key(key, method), 3)
-    mean = jnp.asarray(prior.mean)
-    root = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
-    members = mean[:, None] + noise(own, root, count)
-    return EnsembleState(jnp.asarray(t0, mean.dtype), members, path, sight)
+    own, path, sight = jax.random.split(key, 3)
+    members = prior.mean[:, None] + noise(own, cholesky.factor(prior.cov).lower, count)
+    return EnsembleState(t0, members, path, sight)
 
 
 def noise(key: Array, root: Array, count: int) -> Array:
@@ -120,15 +116,20 @@ def look(model: Model, params: Any, members: Array, there: Array, measurement: M
 
     offsets = jax.vmap(offset, in_axes=1, out_axes=1)(there)
     shift = mean_of(offsets)
-    all_finite = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
-    deviations = jnp.where(mask[:, None] & all_finite, offsets - shift[:, None], 0)
+    every_offset = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
+    deviations = jnp.where(mask[:, None] & every_offset, offsets - shift[:, None], 0)
+    # After an exact measurement members differ by rounding only, which would be weighed like
+    # knowledge by the next one: a component without noise would divide by it.
+    rounding = 8 * jnp.finfo(origin.dtype).eps * jnp.abs(origin)
+    apart = jnp.max(jnp.abs(deviations), 1) > rounding
+    deviations = jnp.where(apart[:, None], deviations, 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
     cov = spread(deviations) + R
-    good = all_finite & numbers(difference, cov, mask)
-    mask = mask & good
+    all_finite = every_offset & numbers(difference, cov, mask)
+    mask = mask & all_finite
     innovation = gaussian.innovate(difference, covariance(deviations, members), cov, mask)
     root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
-    return Look(jnp.where(good, deviations, 0), root, innovation, mask, good)
+    return Look(jnp.where(all_finite, deviations, 0), root, innovation, mask, all_finite)
 
 
 def perturbed(members: Array, looked: Look, key: Array) -> Array:
@@ -156,13 +157,6 @@ def transformed(members: Array, looked: Look) -> Array:
     gain = cholesky.backward(both, white).T
     step = matvec(gaussian.gain(innovation), innovation.value)
     return members + step[:, None] - matmul(gain, looked.deviations)
-
-
-def info_of(looked: Look, delay: Array, used: Array, status: Array) -> Info:
-    """Diagnostics of an update with this look."""
-    density = gaussian.log_density(looked.innovation, looked.mask)
-    value, cov = looked.innovation.value, looked.innovation.cov
-    return Info(value, cov, jnp.where(used, density, 0), delay, status)
 
 
 def mean_of(members: Array) -> Array:

@@ -58,7 +58,7 @@ def lines(
         _, ahead = form.moved(model, params, state.particles, first, state.time, measurement.time)
         seen = weighing.look(model, params, ahead, state.log_weights, measurement)
         moved = Lines(measurement.time, ahead, state.fixed, state.log_weights, key)
-        log_weights, _ = weighing.weigh(moved, seen, measurement, reachable=True)
+        log_weights, _ = weighing.weigh(moved, seen, measurement)
         (ahead, fixed), log_weights = form.refreshed(
             second, (ahead, state.fixed), log_weights, count / 2
         )

@@ -56,17 +56,13 @@ def collapse_factor(collapse: float | None) -> float | None:
     return None if collapse is None else float(checks.at_least("collapse", collapse, 1.0))
 
 
-def draw(kind: Cloud, method: str, prior: Gaussian | None, t0: Any, key: Any) -> ParticleState:
+def drawn(kind: Cloud, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
     """Equally weighted particles drawn from the prior, whose covariance may be singular."""
-    prior = checks.needs_prior(prior, method)
-    checks.prior(prior)
-    key = checks.needs_key(key, method)
-    mean = jnp.asarray(prior.mean)
-    N, dtype = kind.particles, mean.dtype
+    N, dtype = kind.particles, t0.dtype
     key, ours = jax.random.split(key)
-    particles = mean[:, None] + noise(ours, jnp.asarray(prior.cov, dtype), N)
+    particles = prior.mean[:, None] + noise(ours, prior.cov, N)
     log_weights = jnp.full(N, -jnp.log(jnp.asarray(N, dtype)), dtype)
-    return ParticleState(jnp.asarray(t0, dtype), particles, log_weights, key)
+    return ParticleState(t0, particles, log_weights, key)
 
 
 def noise(key: Array, cov: Array, count: int) -> Array:
@@ -94,24 +90,19 @@ def transported(model: Model, params: Any, particles: Array, t0: Array, t1: Arra
     return jax.vmap(move, -1, -1)(particles)
 
 
-def leave(state: State, time: Array, go: Callable[[State], State]) -> State:
-    """`go(state)` if `time` is later, `state` itself if it is the same, NaN if it is earlier."""
+def mover(kind: Cloud) -> Callable[[Any, State, Array], State]:
+    """The `move` of a recursion whose particles keep nothing of their past."""
 
-    def stay(state: State) -> State:
-        particles = jnp.where(time == state.time, state.particles, jnp.nan)
-        return state._replace(time=time, particles=particles)
+    def move(params: Any, state: State, time: Array) -> State:
+        return if_later(state, time, lambda old: step_ahead(kind, params, old, time)[0])
 
-    return lax.cond(time > state.time, go, stay, state)
+    return move
 
 
-def predictor(kind: Cloud) -> Callable[[Any, State, Array], State]:
-    """The `predict` of an estimator whose particles keep nothing of their past."""
-
-    def predict(params: Any, state: State, time: Array) -> State:
-        time = jnp.asarray(time, state.time.dtype)
-        return leave(state, time, lambda s: step_ahead(kind, params, s, time)[0])
-
-    return predict
+def if_later(state: State, time: Array, go: Callable[[State], State]) -> State:
+    """`go(state)` if `time` is later than the state's, else the state, which is then not moved by
+    noise of no variance: keys are used up, and weights spent, by moving only."""
+    return lax.cond(time > state.time, go, lambda old: old, state)
 
 
 def step_ahead(
@@ -189,7 +180,7 @@ def moments(x: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def estimate(params: Any, state: Any) -> Gaussian:
-    """The `estimate` of an estimator whose state begins with the fields of `ParticleState`."""
+    """The `estimate` of a recursion whose state begins with the fields of `ParticleState`."""
     del params
     return summary(state)
 

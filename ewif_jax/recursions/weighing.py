@@ -13,7 +13,6 @@ from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.resampling import effective_sample_size
 from ewif_jax.models import Model
 from ewif_jax.models.sensor_range import check_sensor
-from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.particles import moments
 from ewif_jax.types import Info, Measurement, Status
 
@@ -40,9 +39,9 @@ class Compared(NamedTuple):
     factor: cholesky.Factor
 
 
-def within_reach(measurement: Measurement, reachable: Array | bool) -> Measurement:
-    """The measurement, or nothing where the filter cannot reach back to it."""
-    return measurement._replace(mask=measurement.mask & reachable)
+def is_late(state: Any, measurement: Measurement) -> Array:
+    """Whether there is something to look back for, () bool: a branch not taken costs nothing."""
+    return (measurement.time < state.time) & jnp.any(measurement.mask)
 
 
 def look(
@@ -161,44 +160,29 @@ def judged(cov: Array, numbers: Array) -> Array:
 
 
 def weigh(
-    state: Any,
-    seen: Seen,
-    measurement: Measurement,
-    reachable: Array | bool,
-    collapse: float | None = None,
+    state: Any, seen: Seen, measurement: Measurement, collapse: float | None = None
 ) -> tuple[Array, Info]:
     r"""Log weights :math:`\log w_i + \log p(z | x_i)`, normalised (N,), and the `Info`.
 
     The log likelihood is the logarithm of the mean density under the old weights. The weights stay
-    as they were if no particle could have caused the measurement, or if it is late and leaves less
-    than 1 / `collapse` of the effective particles (`REJECTED`), and if it is late and not
-    `reachable` (`TOO_LATE`).
+    as they were, and the measurement is `REJECTED`, if no particle could have caused it, or if it
+    is late and leaves less than 1 / `collapse` of the effective particles.
     """
-    late = measurement.time < state.time
-    present = jnp.any(measurement.mask)
     joint = state.log_weights + seen.log_density
-    kept = jnp.any(joint > -jnp.inf)
-    joint = jnp.where(kept, joint, state.log_weights)
+    explained = jnp.any(joint > -jnp.inf)
+    # Minus infinity everywhere has no derivative: what is refused is not computed with.
+    joint = jnp.where(explained, joint, state.log_weights)
     evidence = logsumexp(joint)
-    log_weights = joint - evidence
+    log_weights, accepted = joint - evidence, explained
     if collapse is not None:
         before, after = (effective_sample_size(w) for w in (state.log_weights, log_weights))
-        kept = kept & ~(late & (after * collapse < before))
-    reached = ~late | jnp.asarray(reachable)
-    used = present & kept & reached
-    status = verdict(late, kept, Status.LATE_USED)
-    status = jnp.where(kept, status, jnp.int32(Status.REJECTED))
-    status = jnp.where(reached, status, jnp.int32(Status.TOO_LATE))
+        is_late = measurement.time < state.time
+        accepted = explained & ~(is_late & (after * collapse < before))
     info = Info(
         seen.innovation,
         seen.innovation_cov,
-        jnp.where(used, evidence, 0),
-        state.time - measurement.time,
-        jnp.where(present, status, jnp.int32(Status.MASKED)),
+        evidence,
+        jnp.zeros((), evidence.dtype),
+        jnp.where(accepted, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),
     )
-    return jnp.where(used, log_weights, state.log_weights), info
-
-
-def was_used(info: Info) -> Array:
-    """Whether the measurement entered the estimate, () bool."""
-    return (info.status == Status.USED) | (info.status == Status.LATE_USED)
+    return jnp.where(accepted, log_weights, state.log_weights), info

@@ -52,14 +52,14 @@ def test_an_ensemble_moves_as_one(name, late):
     if late:
         state, _ = update(state, measured(0.0, 0.2))
         state = before = method.predict(None, state, jnp.asarray(1e-10))
-    x = np.asarray(before.now.members if name.startswith("enkf") else before.members)
+    x = np.asarray(before.members)
     e, predicted = moments(x)
     S = e @ e / (COUNT - 1) + NOISE
     K = (x - x.mean(1, keepdims=True)) @ e / (COUNT - 1) / S
     for z in (0.1, 3.0, -2.5):
         after, info = update(state, measured(0.0, z))
         nu = wrapped(z - predicted)
-        y = np.asarray(after.now.members if name.startswith("enkf") else after.members)
+        y = np.asarray(after.members)
         spread = np.trace(np.cov(x) - np.outer(K, K) * S)
         tolerance = 1e-3 if late else 1e-9
         np.testing.assert_allclose(info.innovation[0], nu, rtol=0, atol=tolerance)

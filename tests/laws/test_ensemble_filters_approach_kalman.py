@@ -99,7 +99,7 @@ def test_at_delay_zero_the_late_filters_are_the_ensemble_filter_member_by_member
     options = {"prior": PROBLEM.prior, "t0": 0.0, "key": jax.random.key(2)}
     late = ej.run(built(name, 6), None, data, **options)
     plain = ej.run(built("stochastic", 6), None, data, **options)
-    members = late.final_state.now.members
+    members = late.final_state.members
     np.testing.assert_allclose(members, plain.final_state.members, atol=1e-11)
     np.testing.assert_allclose(late.info.log_likelihood, plain.info.log_likelihood, atol=1e-11)
 
