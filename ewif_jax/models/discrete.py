@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from ewif_jax import checks
+from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
@@ -27,7 +28,7 @@ Function = Callable[..., Array]
 class Stride(NamedTuple):
     """What some steps do: F (n, n), and b (n,) and Q (n, n) where they are asked for."""
 
-    F: Any
+    F: Any = None
     b: Any = None
     Q: Any = None
 
@@ -111,17 +112,14 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
         # In a batch all branches run: nothing is inverted or multiplied up that is not asked for,
         # or its derivative would be infinity times 0.
-        ahead, behind = jnp.where(k > 1, first, eye), jnp.where(k < 0, first, eye)
+        ahead, behind = _chosen(k > 1, first, eye), _chosen(k < 0, first, eye)
         return _switch(
             [
-                (k > 1, lambda: _power(Stride(ahead), [], jnp.maximum(k, 0), steps).F),
+                (k > 1, lambda: _power(Stride(ahead), Stride(), jnp.maximum(k, 0), steps).F),
                 (k == -1, lambda: jnp.linalg.inv(behind)),
-                (
-                    k < -1,
-                    lambda: _power(Stride(jnp.linalg.inv(behind)), [], jnp.maximum(-k, 0), steps).F,
-                ),
+                (k < -1, lambda: _power(Stride(jnp.linalg.inv(behind)), Stride(), jnp.maximum(-k, 0), steps).F),
             ],
-            lambda: jnp.where(k > 0, first, _nothing(eye, whole)),
+            lambda: _chosen(k > 0, first, _nothing(eye, whole)),
         )
 
     return matrix
@@ -139,8 +137,10 @@ def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), b=first)
             return _power(one, table, jnp.maximum(k, 0), steps).b
 
-        nothing = _nothing(jnp.zeros_like(first), whole)
-        return _switch([(k > 1, many)], lambda: jnp.where(k > 0, first, nothing))
+        return _switch(
+            [(k > 1, many)],
+            lambda: _chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+        )
 
     return gathered
 
@@ -157,85 +157,106 @@ def noise_of_steps(F: Any, Q: Any, steps: Steps) -> Function:
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), Q=first)
             return _power(one, table, jnp.maximum(k, 0), steps).Q
 
-        nothing = _nothing(jnp.zeros_like(first), whole)
-        return _switch([(k > 1, many)], lambda: jnp.where(k > 0, first, nothing))
+        return _switch(
+            [(k > 1, many)],
+            lambda: _chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+        )
 
     return summed
 
 
 def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
     back = np.linalg.inv(F) if full_rank(F) else np.full(F.shape, np.nan)
-    ahead = [one.F for one in _doublings(F, None, None, steps)]
-    behind = [one.F for one in _doublings(back, None, None, steps)]
+    ahead, behind = (_doublings(one, None, None, steps).F for one in (F, back))
 
     def matrix(params: Any, t0: Array, t1: Array) -> Array:
         del params
         k, whole = count_steps(steps, t0, t1)
-        still = _nothing(jnp.eye(F.shape[0]), whole)
+        eye = jnp.eye(F.shape[0])
 
         def many() -> Array:
-            table = [
-                Stride(jnp.where(k < 0, jnp.asarray(b), jnp.asarray(a)))
-                for a, b in zip(ahead, behind, strict=True)
-            ]
-            return _power(table[0], table, abs(k), steps).F
+            table = Stride(_chosen(k < 0, array(behind), array(ahead)))
+            return _power(Stride(eye), table, abs(k), steps).F
 
         def single() -> Array:
-            return jnp.where(k > 0, jnp.asarray(F), jnp.where(k < 0, jnp.asarray(back), still))
+            step = _chosen(k < 0, array(back), array(F))
+            return _chosen(k == 0, _nothing(eye, whole), step)
 
         return _switch([(abs(k) > 1, many)], single)
 
     return matrix
 
 
-def _doublings(F: Any, b: Any, Q: Any, steps: Steps) -> list[Stride]:
-    """What 1, 2, 4, ... steps do, of what are arrays; made once, in float64."""
+def _doublings(F: Any, b: Any, Q: Any, steps: Steps) -> Stride:
+    """What 1, 2, 4, ... steps do, of what are arrays, stacked; made once, in float64."""
     if not isinstance(F, np.ndarray):
-        return []
+        return Stride()
     b, Q = (x if isinstance(x, np.ndarray) else None for x in (b, Q))
     table = [Stride(F, b, Q)]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(steps.max_steps.bit_length() - 1):
             table.append(then(table[-1], table[-1], np.matmul, np.matmul))
-    return table
+    return Stride(*(None if x[0] is None else np.stack(x) for x in zip(*table, strict=True)))
 
 
-def _power(one: Stride, table: list[Stride], k: Array, steps: Steps) -> Stride:
-    """What k >= 0 steps do; `table` holds what is known of 1, 2, 4, ... steps."""
-    zero = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
-    still = zero._replace(F=jnp.eye(one.F.shape[0], dtype=one.F.dtype))
-    total, square = still, one
-    for digit in range(steps.max_steps.bit_length()):
-        if digit:
+def _power(one: Stride, table: Stride, k: Array, steps: Steps) -> Stride:
+    """What k >= 0 steps do; `table` holds what is known of 1, 2, 4, ... steps, stacked."""
+    still = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
+    still = still._replace(F=jnp.eye(one.F.shape[0], dtype=one.F.dtype))
+    table = Stride(
+        *(None if x is None or y is None else array(x, y.dtype) for x, y in zip(table, one))
+    )
+    free = Stride(*(x if y is None else None for x, y in zip(one, table, strict=True)))
+
+    def digit(carry: tuple[Stride, Stride], now: tuple[Array, Stride]) -> tuple[Any, None]:
+        (total, free), (number, looked_up) = carry, now
+        square = _either(looked_up, free)
+        total = then(total, _chosen((k >> number) % 2 == 1, square, still), matmul, matvec)
+        if any(x is not None for x in free):
             # What no digit needs is never squared: it may overflow.
-            square = _chosen(k >> digit > 0, square, still)
+            square = _chosen(k >> (number + 1) > 0, square, still)
             square = then(square, square, matmul, matvec)
-        if table:
-            known = zip(table[digit], square, strict=True)
-            square = Stride(
-                *(y if x is None or y is None else jnp.asarray(x, y.dtype) for x, y in known)
+            free = Stride(
+                *(None if x is None else y for x, y in zip(free, square, strict=True))
             )
-        total = then(total, _chosen((k >> digit) % 2 == 1, square, still), matmul, matvec)
-    return total
+        return (total, free), None
+
+    start = still if one.b is None and one.Q is None else still._replace(F=None)
+    count = checks.known(k)
+    if count is None:
+        numbers = jnp.arange(steps.max_steps.bit_length(), dtype=jnp.int32)
+        return lax.scan(digit, (start, free), (numbers, table))[0][0]
+    carry = (start, free)
+    for number in range(int(count).bit_length()):
+        carry, _ = digit(carry, (number, jax.tree.map(lambda x, n=number: x[n], table)))
+    return carry[0]
+
+
+def _either(first: Stride, second: Stride) -> Stride:
+    return Stride(*(y if x is None else x for x, y in zip(first, second, strict=True)))
 
 
 def then(first: Stride, second: Stride, matmul: Function, matvec: Function) -> Stride:
-    """What both do, one after the other."""
+    """What both do, one after the other; the F of the first may be left out."""
     b, Q = None, None
     if first.b is not None and second.b is not None:
         b = matvec(second.F, first.b) + second.b
     if first.Q is not None and second.Q is not None:
         Q = matmul(matmul(second.F, first.Q), second.F.T) + second.Q
-    return Stride(matmul(second.F, first.F), b, Q)
+    return Stride(None if first.F is None else matmul(second.F, first.F), b, Q)
 
 
-def _chosen(condition: Array, stride: Stride, still: Stride) -> Stride:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), stride, still)
+def _chosen(condition: Any, first: Any, second: Any) -> Any:
+    """`first` where the condition holds, else `second`."""
+    is_concrete = checks.known(condition)
+    if is_concrete is not None:
+        return first if is_concrete else second
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), first, second)
 
 
-def _nothing(still: Array, whole: Array) -> Array:
+def _nothing(still: Array, whole: Any) -> Array:
     """What no step does; NaN where the steps are not whole."""
-    return jnp.where(whole, still, jnp.asarray(jnp.nan, still.dtype))
+    return _chosen(whole, still, jnp.full_like(still, jnp.nan))
 
 
 def _first(argument: str, value: Any, params: Any, expected: tuple[int | str, ...]) -> Array:
