@@ -1,14 +1,9 @@
-"""Constants as a model in discrete time: what k steps do is composed from what one does.
-
-One step is x -> F x + b + w. Two make F2 F1, F2 b1 + b2 and F2 Q1 F2' + Q2, so k steps are a
-product, over the binary digits of k, of what 1, 2, 4, ... steps do: 5 = 101 in binary is 1 and 4.
-"""
+"""Constants as a model in discrete time: one step is x -> F x + b + w."""
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -16,21 +11,13 @@ from jax.core import Tracer
 
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
-from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
+from ewif_jax.models.powers import Stride, chosen, looked_up, power, squares_of, tables_of
 from ewif_jax.models.steps import count_steps
 from ewif_jax.types import Steps
 
 Function = Callable[..., Array]
-
-
-class Stride(NamedTuple):
-    """What some steps do: F (n, n), and b (n,) and Q (n, n) where they are asked for."""
-
-    F: Any = None
-    b: Any = None
-    Q: Any = None
 
 
 def is_discrete(value: Any) -> bool:
@@ -112,14 +99,14 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
         # In a batch all branches run: nothing is inverted or multiplied up that is not asked for,
         # or its derivative would be infinity times 0.
-        ahead, behind = _chosen(k > 1, first, eye), _chosen(k < 0, first, eye)
+        ahead, behind = chosen(k > 1, first, eye), chosen(k < 0, first, eye)
         return _switch(
             [
-                (k > 1, lambda: _power(Stride(ahead), Stride(), jnp.maximum(k, 0), steps).F),
+                (k > 1, lambda: power(Stride(ahead), k, steps).F),
                 (k == -1, lambda: jnp.linalg.inv(behind)),
-                (k < -1, lambda: _power(Stride(jnp.linalg.inv(behind)), Stride(), jnp.maximum(-k, 0), steps).F),
+                (k < -1, lambda: power(Stride(jnp.linalg.inv(behind)), -k, steps).F),
             ],
-            lambda: _chosen(k > 0, first, _nothing(eye, whole)),
+            lambda: chosen(k > 0, first, _nothing(eye, whole)),
         )
 
     return matrix
@@ -127,19 +114,23 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
 
 def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
     """The input (n,) gathered from t0 to t1 >= t0, as a function of (params, t0, t1)."""
-    table = _doublings(F, b, None, steps)
+    is_table = isinstance(F, np.ndarray) and isinstance(b, np.ndarray)
+    tables = tables_of(Stride(F, b=b), steps) if is_table else []
+    squares = squares_of(F, steps)
 
     def gathered(params: Any, t0: Array, t1: Array) -> Array:
         first = _first("b", b, params, ("n",))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
+            if tables:
+                return looked_up(tables, k).b
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), b=first)
-            return _power(one, table, jnp.maximum(k, 0), steps).b
+            return power(one, k, steps, squares).b
 
         return _switch(
             [(k > 1, many)],
-            lambda: _chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
         )
 
     return gathered
@@ -147,19 +138,23 @@ def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
 
 def noise_of_steps(F: Any, Q: Any, steps: Steps) -> Function:
     """Q (n, n) from t0 to t1 as a function of (params, t0, t1), zero against time."""
-    table = _doublings(F, None, Q, steps)
+    is_table = isinstance(F, np.ndarray) and isinstance(Q, np.ndarray)
+    tables = tables_of(Stride(F, Q=Q), steps) if is_table else []
+    squares = squares_of(F, steps)
 
     def summed(params: Any, t0: Array, t1: Array) -> Array:
         first = _first("Q", Q, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
+            if tables:
+                return looked_up(tables, k).Q
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), Q=first)
-            return _power(one, table, jnp.maximum(k, 0), steps).Q
+            return power(one, k, steps, squares).Q
 
         return _switch(
             [(k > 1, many)],
-            lambda: _chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
         )
 
     return summed
@@ -167,101 +162,34 @@ def noise_of_steps(F: Any, Q: Any, steps: Steps) -> Function:
 
 def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
     back = np.linalg.inv(F) if full_rank(F) else np.full(F.shape, np.nan)
-    ahead, behind = (_doublings(one, None, None, steps).F for one in (F, back))
+    tables = [
+        Stride(np.concatenate([ahead.F, behind.F]))
+        for ahead, behind in zip(
+            tables_of(Stride(F), steps), tables_of(Stride(back), steps), strict=True
+        )
+    ]
 
     def matrix(params: Any, t0: Array, t1: Array) -> Array:
         del params
         k, whole = count_steps(steps, t0, t1)
-        eye = jnp.eye(F.shape[0])
-
-        def many() -> Array:
-            table = Stride(_chosen(k < 0, array(behind), array(ahead)))
-            return _power(Stride(eye), table, abs(k), steps).F
 
         def single() -> Array:
-            step = _chosen(k < 0, array(back), array(F))
-            return _chosen(k == 0, _nothing(eye, whole), step)
+            step = chosen(k < 0, array(back), array(F))
+            return chosen(k == 0, _nothing(jnp.eye(F.shape[0]), whole), step)
 
-        return _switch([(abs(k) > 1, many)], single)
+        return _switch([(abs(k) > 1, lambda: looked_up(tables, k).F)], single)
 
     return matrix
 
 
-def _doublings(F: Any, b: Any, Q: Any, steps: Steps) -> Stride:
-    """What 1, 2, 4, ... steps do, of what are arrays, stacked; made once, in float64."""
-    if not isinstance(F, np.ndarray):
-        return Stride()
-    b, Q = (x if isinstance(x, np.ndarray) else None for x in (b, Q))
-    table = [Stride(F, b, Q)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(steps.max_steps.bit_length() - 1):
-            table.append(then(table[-1], table[-1], np.matmul, np.matmul))
-    return Stride(*(None if x[0] is None else np.stack(x) for x in zip(*table, strict=True)))
-
-
-def _power(one: Stride, table: Stride, k: Array, steps: Steps) -> Stride:
-    """What k >= 0 steps do; `table` holds what is known of 1, 2, 4, ... steps, stacked."""
-    still = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
-    still = still._replace(F=jnp.eye(one.F.shape[0], dtype=one.F.dtype))
-    table = Stride(
-        *(None if x is None or y is None else array(x, y.dtype) for x, y in zip(table, one))
-    )
-    free = Stride(*(x if y is None else None for x, y in zip(one, table, strict=True)))
-
-    def digit(carry: tuple[Stride, Stride], now: tuple[Array, Stride]) -> tuple[Any, None]:
-        (total, free), (number, looked_up) = carry, now
-        square = _either(looked_up, free)
-        total = then(total, _chosen((k >> number) % 2 == 1, square, still), matmul, matvec)
-        if any(x is not None for x in free):
-            # What no digit needs is never squared: it may overflow.
-            square = _chosen(k >> (number + 1) > 0, square, still)
-            square = then(square, square, matmul, matvec)
-            free = Stride(
-                *(None if x is None else y for x, y in zip(free, square, strict=True))
-            )
-        return (total, free), None
-
-    start = still if one.b is None and one.Q is None else still._replace(F=None)
-    count = checks.known(k)
-    if count is None:
-        numbers = jnp.arange(steps.max_steps.bit_length(), dtype=jnp.int32)
-        return lax.scan(digit, (start, free), (numbers, table))[0][0]
-    carry = (start, free)
-    for number in range(int(count).bit_length()):
-        carry, _ = digit(carry, (number, jax.tree.map(lambda x, n=number: x[n], table)))
-    return carry[0]
-
-
-def _either(first: Stride, second: Stride) -> Stride:
-    return Stride(*(y if x is None else x for x, y in zip(first, second, strict=True)))
-
-
-def then(first: Stride, second: Stride, matmul: Function, matvec: Function) -> Stride:
-    """What both do, one after the other; the F of the first may be left out."""
-    b, Q = None, None
-    if first.b is not None and second.b is not None:
-        b = matvec(second.F, first.b) + second.b
-    if first.Q is not None and second.Q is not None:
-        Q = matmul(matmul(second.F, first.Q), second.F.T) + second.Q
-    return Stride(None if first.F is None else matmul(second.F, first.F), b, Q)
-
-
-def _chosen(condition: Any, first: Any, second: Any) -> Any:
-    """`first` where the condition holds, else `second`."""
-    is_concrete = checks.known(condition)
-    if is_concrete is not None:
-        return first if is_concrete else second
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), first, second)
-
-
 def _nothing(still: Array, whole: Any) -> Array:
     """What no step does; NaN where the steps are not whole."""
-    return _chosen(whole, still, jnp.full_like(still, jnp.nan))
+    return chosen(whole, still, jnp.full_like(still, jnp.nan))
 
 
 def _first(argument: str, value: Any, params: Any, expected: tuple[int | str, ...]) -> Array:
     """What a discrete F, Q or b is for one step."""
-    made = jnp.asarray(value(params) if callable(value) else value)
+    made = array(value(params) if callable(value) else value)
     checks.shape(argument, made, expected)
     return made if jnp.issubdtype(made.dtype, jnp.floating) else made.astype(float)
 
