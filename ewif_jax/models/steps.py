@@ -97,6 +97,21 @@ def check_steps(
         )
 
 
+def check_interval(steps: Steps | None, argument: str, interval: Any) -> None:
+    """Refuses a known interval () that is not whole steps of a discrete model."""
+    seconds = checks.known(interval)
+    if steps is None or seconds is None:
+        return
+    checks.require(
+        count_steps(steps, np.zeros(()), seconds.astype(float))[1],
+        argument,
+        f"whole steps of dt = {steps.dt:g} s, at most max_steps = {steps.max_steps} of them, since "
+        "constants in linear_model are a model in discrete time (give linear_model the step of its "
+        "constants as dt=)",
+        float(seconds),
+    )
+
+
 def _refuse(bad: np.ndarray, message: str) -> None:
     if bad.any():
         raise ValueError(message)

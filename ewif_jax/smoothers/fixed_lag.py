@@ -13,6 +13,7 @@ from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.linearise import predict_measurement, predict_state
 from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.steps import check_interval
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
 from ewif_jax.recursions.information import InformationState
@@ -148,14 +149,21 @@ def fixed_lag_ewif(
     Reduces to: `ewif` for lag 0; `batch_wls` at the reported time with the weight of `ewif`.
 
     Raises:
-        ValueError: as `ewif`; lag < 0.
+        ValueError: as `ewif`; lag < 0, or not whole steps of a discrete model.
     """
     filtered = ewif(model, tau, weight=weight)
     if not callable(lag):
-        checks.at_least("lag", lag, 0.0)
+        _check_lag(model, lag)
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
-        behind = checks.at_least("lag", resolve(lag, params), 0.0)
+        behind = _check_lag(model, resolve(lag, params))
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
     return Estimator(*filtered[:3], estimate, model=model)
+
+
+def _check_lag(model: Model, lag: Any) -> Any:
+    """Refuses a known lag that is negative or no interval of the model; returns it."""
+    checks.shape("lag", lag, ())
+    check_interval(model.steps, "lag", checks.at_least("lag", lag, 0.0))
+    return lag

@@ -69,7 +69,7 @@ NOTHING_MOVES = {
 @pytest.mark.parametrize("name", NOTHING_MOVES)
 def test_no_steady_gain(name):
     for function in (ej.steady_state_gain, ej.cutoff_delay, lambda *s: ej.delayed_gain(*s, 2)):
-        with pytest.raises(ValueError, match="^R: "):
+        with pytest.raises(ValueError, match=r"^R: "):
             function(*NOTHING_MOVES[name])
 
 
@@ -94,7 +94,7 @@ def test_bounds_refuse_exact_measurements(R):
         lambda: ej.pcrlb_late(model, params, STREAM, TRUTH, **late),
         lambda: ej.analysis.pcrlb_equivalent(model, params, STREAM, TRUTH, **late),
     ):
-        with pytest.raises(ValueError, match="^R: .* no finite information"):
+        with pytest.raises(ValueError, match=r"^R: .* no finite information"):
             bound()
 
 
