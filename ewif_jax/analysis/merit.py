@@ -12,7 +12,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.analysis.powers import last_time_above, real_power
 from ewif_jax.analysis.riccati import gain
-from ewif_jax.analysis.stabilising import strong_dare
+from ewif_jax.analysis.stabilising import check_seen_noise, predicted_dare
 
 
 def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
@@ -280,28 +280,13 @@ def _followed(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> G
 
 @jax.jit
 def _steady_gain(F: Array, H: Array, Q: Array, R: Array) -> Array:
-    return gain(_predicted(F, H, Q, R), H, R)
-
-
-def _predicted(F: Array, H: Array, Q: Array, R: Array) -> Array:
-    """The steady predicted covariance, where R may be singular.
-
-    The estimate after a measurement obeys a Riccati equation too, with the next measurement seen
-    from before the motion: z = H F x + (H w + v). Its noise R + H Q H' has an inverse where R has
-    none, and what it shares with w is taken out of F and Q.
-    """
-    taken = jnp.linalg.solve(R + H @ Q @ H.T, H @ Q).T
-    kept = jnp.eye(F.shape[0], dtype=F.dtype) - taken @ H
-    own = kept @ Q @ kept.T + taken @ R @ taken.T
-    after = strong_dare(kept @ F, H @ F, (own + own.T) / 2, R + H @ Q @ H.T)
-    before = F @ after @ F.T + Q
-    return (before + before.T) / 2
+    return gain(predicted_dare(F, H, Q, R), H, R)
 
 
 @jax.jit
 def _settled(F: Array, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     """K, and (I - K H) F."""
-    K = gain(_predicted(F, H, Q, R), H, R)
+    K = gain(predicted_dare(F, H, Q, R), H, R)
     return K, (jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F
 
 
@@ -339,23 +324,5 @@ def _system(F: Any, H: Any, Q: Any, R: Any) -> tuple[Array, Array, Array, Array]
     checks.finite("H", H)
     checks.psd("Q", Q)
     checks.psd("R", R)
-    _seen_noise(H, Q, R)
+    check_seen_noise(H, Q, R)
     return F, H, Q, R
-
-
-def _seen_noise(H: Array, Q: Array, R: Array) -> None:
-    """Refuses a known R without which nothing keeps the innovations from being exact."""
-    given = [checks.known(x) for x in (H, Q, R)]
-    if any(x is None for x in given):
-        return
-    look, noise, own = (np.asarray(x, float) for x in given)
-    total = look @ noise @ look.T + own
-    least = np.linalg.eigvalsh(total).min(initial=np.inf)
-    enough = least > 8 * len(total) * np.finfo(float).eps * abs(total).max(initial=0.0)
-    checks.require(
-        enough or np.linalg.eigvalsh(own).min(initial=np.inf) > 0,
-        "R",
-        "R, or R + H Q H', to be positive definite: what is measured exactly and not driven by "
-        "noise is known for good, and has no steady gain (give it a small variance)",
-        f"R = {own.tolist()} with smallest eigenvalue {least:.3g} of R + H Q H'",
-    )
