@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
@@ -47,17 +48,19 @@ def crlb(
         information: (n, n) prior information matrix at `time`, or None for nothing.
 
     Returns:
-        (n, n); NaN if the measurements do not determine the state, or an R is singular (an exact
-        measurement has no finite information: give it a small variance).
+        (n, n); NaN if the measurements do not determine the state, or an R that is not known is
+        singular.
 
     Reduces to: the covariance of `kalman` without process noise; that of `ewif` with its weight.
 
     Raises:
-        ValueError: unusable measurements, state or time.
+        ValueError: unusable measurements, state or time; a known R that is singular (an exact
+            measurement has no finite information: give it a small variance).
     """
     checked_stream(measurements)
     checks.finite("time", time)
     dtype = float_dtype(state)
+    check_finite_information(model, params, measurements)
     stream, time = cast(measurements, dtype), jnp.asarray(time, dtype)
     state = jnp.asarray(state, dtype)
     checks.shape("state", state, ("n",))
@@ -67,6 +70,36 @@ def crlb(
         checks.psd("information", information)
         information = jnp.asarray(information, dtype)
     return _crlb(model, weight, params, stream, state, time, information)
+
+
+def check_finite_information(model: Model, params: Any, measurements: Measurement) -> None:
+    """Refuses a known R that is singular in components that are there: of each sensor and mask, at
+    its first measurement."""
+    given = (params, measurements.time, measurements.sensor, measurements.mask)
+    if any(checks.known(x) is None for x in jax.tree.leaves(given)):
+        return
+    time, sensor, mask = (np.asarray(x) for x in given[1:])
+    _, rows = np.unique(np.column_stack([sensor, mask]), axis=0, return_index=True)
+    for row in rows[mask[rows].any(-1)]:
+        with jax.ensure_compile_time_eval():
+            R = np.asarray(model.measurement_cov(params, np.int32(sensor[row]), time[row]), float)
+        checks.require(
+            _full_rank(R[np.ix_(mask[row], mask[row])]),
+            "R",
+            "a positive definite covariance: an exact measurement has no finite information (give "
+            "it a small variance)",
+            f"{R.tolist()} at row {row}",
+        )
+
+
+def _full_rank(R: np.ndarray) -> bool:
+    """Whether a covariance in any units has an inverse; NaN is left to others."""
+    variances = np.diagonal(R)
+    if np.isnan(R).any() or variances.min() <= 0:
+        return bool(np.isnan(R).any())
+    units = np.sqrt(variances)
+    least = np.linalg.eigvalsh(R / units / units[:, None]).min()
+    return bool(least > len(R) * np.finfo(float).eps)
 
 
 @partial(jax.jit, static_argnames=("model", "weight"))

@@ -12,7 +12,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.analysis.powers import last_time_above, real_power
 from ewif_jax.analysis.riccati import gain
-from ewif_jax.analysis.stabilising import strong_dare
+from ewif_jax.analysis.stabilising import check_seen_noise, predicted_dare
 
 
 def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
@@ -28,14 +28,14 @@ def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
 
     Args:
         F, H, Q, R: (n, n), (m, n), (n, n), (m, m); plain numbers for a scalar system. Q may be
-            singular.
+            singular, and R too (an exact measurement) where R + H Q H' is not.
 
     Returns:
         K, or NaN where the filter has no steady state (a mode that does not decay and is not seen).
         K has no derivative where a mode neither grows nor decays and no noise drives it.
 
     Raises:
-        ValueError: wrong shapes; Q not PSD; R not positive definite.
+        ValueError: wrong shapes; Q or R not PSD; R and R + H Q H' not positive definite.
 
     Reduces to: `random_walk_gain`, `alpha_beta_gains`.
     """
@@ -280,13 +280,13 @@ def _followed(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> G
 
 @jax.jit
 def _steady_gain(F: Array, H: Array, Q: Array, R: Array) -> Array:
-    return gain(strong_dare(F, H, Q, R), H, R)
+    return gain(predicted_dare(F, H, Q, R), H, R)
 
 
 @jax.jit
 def _settled(F: Array, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     """K, and (I - K H) F."""
-    K = gain(strong_dare(F, H, Q, R), H, R)
+    K = gain(predicted_dare(F, H, Q, R), H, R)
     return K, (jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F
 
 
@@ -323,5 +323,6 @@ def _system(F: Any, H: Any, Q: Any, R: Any) -> tuple[Array, Array, Array, Array]
     checks.finite("F", F)
     checks.finite("H", H)
     checks.psd("Q", Q)
-    checks.psd("R", R, definite=True)
+    checks.psd("R", R)
+    check_seen_noise(H, Q, R)
     return F, H, Q, R

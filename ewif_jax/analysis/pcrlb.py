@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.analysis.crlb import check_finite_information
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
@@ -54,7 +55,7 @@ def pcrlb(
     Returns:
         (T, n, n) in products of the units of the state (m^2, m^2/s, ... for kinematic models); the
         square root of a diagonal element bounds an RMSE. NaN from a measurement on whose R is
-        singular: an exact measurement has no finite information (give it a small variance).
+        not known and singular.
 
     Reduces to: the covariance of `kalman` for a linear model; that of `extended` linearised at the
         truth for one trajectory.
@@ -64,11 +65,13 @@ def pcrlb(
         expectation of 1/r^2): give one trajectory at a time then.
 
     Raises:
-        ValueError: wrong shapes; a prior_cov that is not PSD; times before t0 or that go back.
+        ValueError: wrong shapes; a prior_cov that is not PSD; times before t0 or that go back; a
+            known R that is singular (an exact measurement has no finite information: give it a
+            small variance).
     """
     many = jnp.ndim(truth) == 3
     truth, start = (x if many else jnp.asarray(x)[None] for x in (truth, start))
-    stream, truth, first = _checked(model, measurements, truth, start, prior_cov, t0)
+    stream, truth, first = _checked(model, params, measurements, truth, start, prior_cov, t0)
     time = checks.known(measurements.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
@@ -113,7 +116,13 @@ def pcrlb_late(
         ValueError: as in `pcrlb`, except that measurement times may go back.
     """
     arrived, truth, first = _checked(
-        model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
+        model,
+        params,
+        measurements,
+        jnp.asarray(truth)[None],
+        jnp.asarray(start)[None],
+        prior_cov,
+        t0,
     )
     checks.shape("times", times, (truth.shape[1],))
     checks.finite("times", times)
@@ -161,7 +170,13 @@ def pcrlb_equivalent(
         ValueError: as in `pcrlb_late`; report times that go back.
     """
     stream, truth, first = _checked(
-        model, measurements, jnp.asarray(truth)[None], jnp.asarray(start)[None], prior_cov, t0
+        model,
+        params,
+        measurements,
+        jnp.asarray(truth)[None],
+        jnp.asarray(start)[None],
+        prior_cov,
+        t0,
     )
     checks.report_times(times, truth.shape[1])
     times = jnp.asarray(times, truth.dtype)
@@ -264,12 +279,19 @@ def _informed(cov: Array, information: Array) -> Array:
 
 
 def _checked(
-    model: Model, measurements: Measurement, truth: Any, start: Any, prior_cov: Any, t0: Any
+    model: Model,
+    params: Any,
+    measurements: Measurement,
+    truth: Any,
+    start: Any,
+    prior_cov: Any,
+    t0: Any,
 ) -> tuple[Measurement, Array, Bound]:
     """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
     truth, after what can be known is checked."""
     checked_stream(measurements)
     checks.sensors(measurements, model.sensors)
+    check_finite_information(model, params, measurements)
     steps = jnp.shape(measurements.time)[0]
     checks.shape("truth", truth, ("R", steps, "n"))
     runs, _, n = jnp.shape(truth)

@@ -9,8 +9,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
+from ewif_jax import checks
 from ewif_jax.analysis.riccati import dare, gain, riccati_step
 from ewif_jax.kernels import cholesky
 
@@ -54,6 +56,39 @@ def strong_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
         return stabilising_dare(F, H, Q, R)
 
     return lax.cond(settled, lambda P: P, follow, least)
+
+
+def predicted_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    """The solution P (n, n) of `strong_dare`, where R may be singular.
+
+    The estimate after a measurement obeys a Riccati equation too, with the next measurement seen
+    from before the motion: z = H F x + (H w + v). Its noise R + H Q H' has an inverse where R has
+    none, and what it shares with w is taken out of F and Q.
+    """
+    taken = jnp.linalg.solve(R + H @ Q @ H.T, H @ Q).T
+    kept = jnp.eye(F.shape[0], dtype=F.dtype) - taken @ H
+    own = kept @ Q @ kept.T + taken @ R @ taken.T
+    after = strong_dare(kept @ F, H @ F, (own + own.T) / 2, R + H @ Q @ H.T)
+    before = F @ after @ F.T + Q
+    return (before + before.T) / 2
+
+
+def check_seen_noise(H: Array, Q: Array, R: Array) -> None:
+    """Refuses a known R without which nothing keeps the innovations from being exact."""
+    given = [checks.known(x) for x in (H, Q, R)]
+    if any(x is None for x in given):
+        return
+    look, noise, own = (np.asarray(x, float) for x in given)
+    total = look @ noise @ look.T + own
+    least = np.linalg.eigvalsh(total).min(initial=np.inf)
+    enough = least > 8 * len(total) * np.finfo(float).eps * abs(total).max(initial=0.0)
+    checks.require(
+        enough or np.linalg.eigvalsh(own).min(initial=np.inf) > 0,
+        "R",
+        "R, or R + H Q H', to be positive definite: what is measured exactly and not driven by "
+        "noise is known for good, and has no steady gain (give it a small variance)",
+        f"R = {own.tolist()} with smallest eigenvalue {least:.3g} of R + H Q H'",
+    )
 
 
 def stabilising_care(F: Array, H: Array, Q: Array, R: Array) -> Array:

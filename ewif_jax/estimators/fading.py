@@ -58,6 +58,7 @@ def fading(
 
     def per_step(params: Any, t0: Array, t1: Array) -> Array:
         alpha = checks.at_least("fading", resolve(fading, params), 1.0)
+        checks.shape("fading", alpha, ())
         if model.steps is None:
             return jnp.where(t1 > t0, jnp.square(alpha), 1)
         k, _ = count_steps(model.steps, t0, t1)

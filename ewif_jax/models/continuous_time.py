@@ -1,6 +1,6 @@
 """Models given in continuous time, discretised exactly over any interval."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,10 +12,12 @@ from jax.core import Tracer
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.models import domain
-from ewif_jax.models.discrete import Stride, pattern_of_powers, then
+from ewif_jax.models.discrete import pattern_of_powers
 from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
 from ewif_jax.models.parameters import named
+from ewif_jax.models.powers import Stride, then
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 TERMS = 19
 """Of each series: what is left out is below 1 / 20! where the norm of A dt is at most 1/2."""
@@ -23,6 +25,7 @@ HALVINGS = 40
 """How often an interval is halved, at most: enough for a norm of A dt of 5e11."""
 
 
+@from_recipe
 def from_continuous(
     A: Any,
     G: Any,
@@ -166,15 +169,20 @@ def integrated(
     halvings = jnp.where(enough, halvings, 0)
     h = dt * jnp.exp2(-halvings)
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
-    term, total = eye, eye
-    for k in range(1, TERMS):
-        term = matmul(A, term) * (h / k)
-        total = total + term
-    first = Stride(
-        total,
-        None if push is None else _series(lambda x: matvec(A, x), push, h),
-        None if noise is None else _series(lambda x: _both_sides(A, x), noise, h),
-    )
+    starts = Stride(eye, None if push is None else push * h, None if noise is None else noise * h)
+
+    # Each series holds what begins like this and has this (linear) derivative.
+    def following(carry: tuple[Stride, Stride], k: Array) -> tuple[tuple[Stride, Stride], None]:
+        term, total = carry
+        term = Stride(
+            matmul(A, term.F) * (h / k),
+            None if term.b is None else matvec(A, term.b) * (h / (k + 1)),
+            None if term.Q is None else _both_sides(A, term.Q) * (h / (k + 1)),
+        )
+        return (term, jax.tree.map(jnp.add, total, term)), None
+
+    numbers = jnp.arange(1, TERMS, dtype=A.dtype)
+    first = lax.scan(following, (starts, starts), numbers)[0][1]
 
     def doubled(stride: Stride, number: Array) -> tuple[Stride, None]:
         twice = lax.cond(number < halvings, _twice, lambda x: x, stride)
@@ -186,16 +194,6 @@ def integrated(
     found = lax.cond(halvings > 0, all_doubled, lambda x: x, first)
     found = jax.tree.map(lambda x: jnp.where(enough, x, jnp.nan), found)
     return found.F, found.Q, found.b
-
-
-def _series(derivative: Callable[[Array], Array], start: Array, h: Array) -> Array:
-    """The integral from 0 to h of what begins as `start` and has this (linear) derivative."""
-    term = start * h
-    total = term
-    for k in range(2, TERMS + 1):
-        term = derivative(term) * (h / k)
-        total = total + term
-    return total
 
 
 def _both_sides(A: Array, x: Array) -> Array:

@@ -1,35 +1,23 @@
-"""Constants as a model in discrete time: what k steps do is composed from what one does.
-
-One step is x -> F x + b + w. Two make F2 F1, F2 b1 + b2 and F2 Q1 F2' + Q2, so k steps are a
-product, over the binary digits of k, of what 1, 2, 4, ... steps do: 5 = 101 in binary is 1 and 4.
-"""
+"""Constants as a model in discrete time: one step is x -> F x + b + w."""
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
 from ewif_jax import checks
-from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.compiling import array
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
+from ewif_jax.models.powers import Stride, chosen, looked_up, power, squares_of, tables_of
 from ewif_jax.models.steps import count_steps
 from ewif_jax.types import Steps
 
 Function = Callable[..., Array]
-
-
-class Stride(NamedTuple):
-    """What some steps do: F (n, n), and b (n,) and Q (n, n) where they are asked for."""
-
-    F: Any
-    b: Any = None
-    Q: Any = None
 
 
 def is_discrete(value: Any) -> bool:
@@ -111,17 +99,14 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
         # In a batch all branches run: nothing is inverted or multiplied up that is not asked for,
         # or its derivative would be infinity times 0.
-        ahead, behind = jnp.where(k > 1, first, eye), jnp.where(k < 0, first, eye)
+        ahead, behind = chosen(k > 1, first, eye), chosen(k < 0, first, eye)
         return _switch(
             [
-                (k > 1, lambda: _power(Stride(ahead), [], jnp.maximum(k, 0), steps).F),
+                (k > 1, lambda: power(Stride(ahead), k, steps).F),
                 (k == -1, lambda: jnp.linalg.inv(behind)),
-                (
-                    k < -1,
-                    lambda: _power(Stride(jnp.linalg.inv(behind)), [], jnp.maximum(-k, 0), steps).F,
-                ),
+                (k < -1, lambda: power(Stride(jnp.linalg.inv(behind)), -k, steps).F),
             ],
-            lambda: jnp.where(k > 0, first, _nothing(eye, whole)),
+            lambda: chosen(k > 0, first, _nothing(eye, whole)),
         )
 
     return matrix
@@ -129,118 +114,82 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
 
 def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
     """The input (n,) gathered from t0 to t1 >= t0, as a function of (params, t0, t1)."""
-    table = _doublings(F, b, None, steps)
+    is_table = isinstance(F, np.ndarray) and isinstance(b, np.ndarray)
+    tables = tables_of(Stride(F, b=b), steps) if is_table else []
+    squares = squares_of(F, steps)
 
     def gathered(params: Any, t0: Array, t1: Array) -> Array:
         first = _first("b", b, params, ("n",))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
+            if tables:
+                return looked_up(tables, k).b
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), b=first)
-            return _power(one, table, jnp.maximum(k, 0), steps).b
+            return power(one, k, steps, squares).b
 
-        nothing = _nothing(jnp.zeros_like(first), whole)
-        return _switch([(k > 1, many)], lambda: jnp.where(k > 0, first, nothing))
+        return _switch(
+            [(k > 1, many)],
+            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+        )
 
     return gathered
 
 
 def noise_of_steps(F: Any, Q: Any, steps: Steps) -> Function:
     """Q (n, n) from t0 to t1 as a function of (params, t0, t1), zero against time."""
-    table = _doublings(F, None, Q, steps)
+    is_table = isinstance(F, np.ndarray) and isinstance(Q, np.ndarray)
+    tables = tables_of(Stride(F, Q=Q), steps) if is_table else []
+    squares = squares_of(F, steps)
 
     def summed(params: Any, t0: Array, t1: Array) -> Array:
         first = _first("Q", Q, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
+            if tables:
+                return looked_up(tables, k).Q
             one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), Q=first)
-            return _power(one, table, jnp.maximum(k, 0), steps).Q
+            return power(one, k, steps, squares).Q
 
-        nothing = _nothing(jnp.zeros_like(first), whole)
-        return _switch([(k > 1, many)], lambda: jnp.where(k > 0, first, nothing))
+        return _switch(
+            [(k > 1, many)],
+            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+        )
 
     return summed
 
 
 def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
     back = np.linalg.inv(F) if full_rank(F) else np.full(F.shape, np.nan)
-    ahead = [one.F for one in _doublings(F, None, None, steps)]
-    behind = [one.F for one in _doublings(back, None, None, steps)]
+    tables = [
+        Stride(np.concatenate([ahead.F, behind.F]))
+        for ahead, behind in zip(
+            tables_of(Stride(F), steps), tables_of(Stride(back), steps), strict=True
+        )
+    ]
 
     def matrix(params: Any, t0: Array, t1: Array) -> Array:
         del params
         k, whole = count_steps(steps, t0, t1)
-        still = _nothing(jnp.eye(F.shape[0]), whole)
-
-        def many() -> Array:
-            table = [
-                Stride(jnp.where(k < 0, jnp.asarray(b), jnp.asarray(a)))
-                for a, b in zip(ahead, behind, strict=True)
-            ]
-            return _power(table[0], table, abs(k), steps).F
 
         def single() -> Array:
-            return jnp.where(k > 0, jnp.asarray(F), jnp.where(k < 0, jnp.asarray(back), still))
+            step = chosen(k < 0, array(back), array(F))
+            return chosen(k == 0, _nothing(jnp.eye(F.shape[0]), whole), step)
 
-        return _switch([(abs(k) > 1, many)], single)
+        return _switch([(abs(k) > 1, lambda: looked_up(tables, k).F)], single)
 
     return matrix
 
 
-def _doublings(F: Any, b: Any, Q: Any, steps: Steps) -> list[Stride]:
-    """What 1, 2, 4, ... steps do, of what are arrays; made once, in float64."""
-    if not isinstance(F, np.ndarray):
-        return []
-    b, Q = (x if isinstance(x, np.ndarray) else None for x in (b, Q))
-    table = [Stride(F, b, Q)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(steps.max_steps.bit_length() - 1):
-            table.append(then(table[-1], table[-1], np.matmul, np.matmul))
-    return table
-
-
-def _power(one: Stride, table: list[Stride], k: Array, steps: Steps) -> Stride:
-    """What k >= 0 steps do; `table` holds what is known of 1, 2, 4, ... steps."""
-    zero = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
-    still = zero._replace(F=jnp.eye(one.F.shape[0], dtype=one.F.dtype))
-    total, square = still, one
-    for digit in range(steps.max_steps.bit_length()):
-        if digit:
-            # What no digit needs is never squared: it may overflow.
-            square = _chosen(k >> digit > 0, square, still)
-            square = then(square, square, matmul, matvec)
-        if table:
-            known = zip(table[digit], square, strict=True)
-            square = Stride(
-                *(y if x is None or y is None else jnp.asarray(x, y.dtype) for x, y in known)
-            )
-        total = then(total, _chosen((k >> digit) % 2 == 1, square, still), matmul, matvec)
-    return total
-
-
-def then(first: Stride, second: Stride, matmul: Function, matvec: Function) -> Stride:
-    """What both do, one after the other."""
-    b, Q = None, None
-    if first.b is not None and second.b is not None:
-        b = matvec(second.F, first.b) + second.b
-    if first.Q is not None and second.Q is not None:
-        Q = matmul(matmul(second.F, first.Q), second.F.T) + second.Q
-    return Stride(matmul(second.F, first.F), b, Q)
-
-
-def _chosen(condition: Array, stride: Stride, still: Stride) -> Stride:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), stride, still)
-
-
-def _nothing(still: Array, whole: Array) -> Array:
+def _nothing(still: Array, whole: Any) -> Array:
     """What no step does; NaN where the steps are not whole."""
-    return jnp.where(whole, still, jnp.asarray(jnp.nan, still.dtype))
+    return chosen(whole, still, jnp.full_like(still, jnp.nan))
 
 
 def _first(argument: str, value: Any, params: Any, expected: tuple[int | str, ...]) -> Array:
     """What a discrete F, Q or b is for one step."""
-    made = jnp.asarray(value(params) if callable(value) else value)
+    made = array(value(params) if callable(value) else value)
     checks.shape(argument, made, expected)
     return made if jnp.issubdtype(made.dtype, jnp.floating) else made.astype(float)
 

@@ -15,21 +15,29 @@ ROUNDINGS = 4
 """How far it may be in roundings of the times: each of two stamps and their difference have one."""
 
 
-def count_steps(steps: Steps, t0: Any, t1: Any) -> tuple[Array, Array]:
+def count_steps(steps: Steps, t0: Any, t1: Any) -> tuple[Any, Any]:
     """The steps from t0 to t1 (int32, negative against time; 0 where they are not whole), and
     whether they are whole."""
-    start, end = (lax.stop_gradient(_floating(t)) for t in (t0, t1))
+    dtype = jnp.result_type(t0, t1)
+    dtype = dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
+    # In NumPy where it can be: JAX would compile each of these operations by itself.
+    is_concrete = checks.known(t0) is not None and checks.known(t1) is not None
+    xp = np if is_concrete else jnp
+    start, end = (
+        np.asarray(t).astype(dtype) if is_concrete else lax.stop_gradient(jnp.asarray(t, dtype))
+        for t in (t0, t1)
+    )
     interval = end - start
-    number = jnp.round(interval / steps.dt)
-    rounding = ROUNDINGS * jnp.finfo(interval.dtype).eps * jnp.maximum(abs(start), abs(end))
+    number = xp.round(interval / steps.dt)
+    rounding = ROUNDINGS * jnp.finfo(dtype).eps * xp.maximum(abs(start), abs(end))
     # Stamps that are each as near to a grid as they may be differ by twice as much.
-    near = jnp.maximum(2 * SHARE * steps.dt, rounding)
+    near = xp.maximum(2 * SHARE * steps.dt, rounding)
     whole = (
         (abs(interval - number * steps.dt) <= near)
         & (abs(number) <= steps.max_steps)
         & (rounding <= steps.dt / 4)
     )
-    return jnp.where(whole, number, 0).astype(jnp.int32), whole
+    return xp.where(whole, number, 0).astype(jnp.int32), whole
 
 
 def whole_steps(steps: Steps, t0: Any, t1: Any) -> Array:
@@ -89,9 +97,19 @@ def check_steps(
         )
 
 
-def _floating(t: Any) -> Array:
-    t = jnp.asarray(t)
-    return t if jnp.issubdtype(t.dtype, jnp.floating) else t.astype(jnp.result_type(float))
+def check_interval(steps: Steps | None, argument: str, interval: Any) -> None:
+    """Refuses a known interval () that is not whole steps of a discrete model."""
+    seconds = checks.known(interval)
+    if steps is None or seconds is None:
+        return
+    checks.require(
+        count_steps(steps, np.zeros(()), seconds.astype(float))[1],
+        argument,
+        f"whole steps of dt = {steps.dt:g} s, at most max_steps = {steps.max_steps} of them, since "
+        "constants in linear_model are a model in discrete time (give linear_model the step of its "
+        "constants as dt=)",
+        float(seconds),
+    )
 
 
 def _refuse(bad: np.ndarray, message: str) -> None:

@@ -8,6 +8,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.steps import check_interval
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian
@@ -34,14 +35,21 @@ def fixed_lag_ewif(
     Reduces to: `ewif` for lag 0; `batch_wls` at the reported time with the weight of `ewif`.
 
     Raises:
-        ValueError: as `ewif`; lag < 0.
+        ValueError: as `ewif`; lag < 0, or not whole steps of a discrete model.
     """
     filtered = ewif(model, tau, weight=weight)
     if not callable(lag):
-        checks.at_least("lag", lag, 0.0)
+        _check_lag(model, lag)
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
-        behind = checks.at_least("lag", resolve(lag, params), 0.0)
+        behind = _check_lag(model, resolve(lag, params))
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
     return Estimator(*filtered[:3], estimate, model=filtered.model)
+
+
+def _check_lag(model: Model, lag: Any) -> Any:
+    """Refuses a known lag that is negative or no interval of the model; returns it."""
+    checks.shape("lag", lag, ())
+    check_interval(model.steps, "lag", checks.at_least("lag", lag, 0.0))
+    return lag

@@ -146,6 +146,18 @@ REFUSED = {
     ),
     "no way back": (lambda: ej.ewif(ej.linear_model(np.diag([1.0, 0]), H, R), 1.0), "inverse"),
     "dt": (lambda: ej.linear_model(F, H, R, dt=0.0), "dt"),
+    "lag": (
+        lambda: ej.fixed_lag_ewif(ej.linear_model(F, H, R), 1.0, lag=1.5),
+        "lag: expected whole steps of dt = 1 s",
+    ),
+    "lag of params": (
+        lambda: run(
+            ej.stream([1.0], [1.0]),
+            ej.fixed_lag_ewif(ej.linear_model(F, H, R), 1.0, lag=lambda p: p["lag"]),
+            {"lag": 0.5},
+        ),
+        "lag: expected whole steps of dt = 1 s",
+    ),
 }
 
 

@@ -52,6 +52,11 @@ FILTERS = {
     "ensemble": lambda m: ej.ensemble(m, 8),
     "enkf1": lambda m: ej.enkf1(m, 8, 3),
     "bootstrap": lambda m: ej.bootstrap(m, 32),
+    "a1": ej.a1,
+    "b1": ej.b1,
+    "fixed_lag": lambda m: ej.fixed_lag(m, 2),
+    "enkf2": lambda m: ej.enkf2(m, 8, 3),
+    "pf_retrodict": lambda m: ej.pf_retrodict(m, 32),
 }
 
 
