@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """Inputs of other kinds, shapes and dtypes: each must be refused by name, or mean what it says."""
 
 from collections.abc import Callable
@@ -69,7 +70,10 @@ SAME: tuple[tuple[str, Callable[[Any], Any]], ...] = (
     ("big-endian", lambda x: np.asarray(x).astype(np.asarray(x).dtype.newbyteorder(">"))),
     ("not contiguous", lambda x: np.repeat(np.asarray(x), 2, 0)[::2]),
     ("Fortran order", np.asfortranarray),
-    ("read-only", lambda x: np.frombuffer(np.asarray(x).tobytes(), np.asarray(x).dtype).reshape(np.shape(x))),
+    (
+        "read-only",
+        lambda x: np.frombuffer(np.asarray(x).tobytes(), np.asarray(x).dtype).reshape(np.shape(x)),
+    ),
 )
 BAD: tuple[tuple[str, Callable[[Any], Any]], ...] = (
     ("None", lambda x: None),
@@ -92,7 +96,12 @@ LESS: tuple[tuple[str, Callable[[Any], Any]], ...] = (
 CHANGES: tuple[Change, ...] = (
     *(Change(n, f, make) for f in (*_ARRAYS, "sensor", "mask") for n, make in SAME),
     *(Change(n, f, make) for f in _NUMBERS for n, make in SAME if n in ("JAX", "big-endian")),
-    *(Change(n, f, make, REFUSED) for f in (*_ARRAYS, "sensor", "mask", *_NUMBERS) for n, make in BAD),
+    *(
+        Change(n, f, make, REFUSED)
+        for f in (*_ARRAYS, "sensor", "mask", *_NUMBERS)
+        for n, make in BAD
+        if (f, n) not in (("tau", "infinity"), ("tau", "one axis more"))  # no decay; one number
+    ),
     *(Change(n, f, make, REFUSED) for f in (*_ARRAYS, "sensor", "mask") for n, make in LESS),
     *(Change("whole numbers", f, lambda x: np.ones(np.shape(x), int), np.ones(np.shape(CLEAN[f]))) for f in ("value", "mean")),
     Change("whole stamps", "time", lambda x: x.astype(int)),
@@ -123,12 +132,19 @@ CHANGES: tuple[Change, ...] = (
     Change("whole", "q", lambda x: 2, 2.0),
     Change("whole", "r", lambda x: np.int32(2), 2.0),
     Change("whole", "tau", lambda x: 2, 2.0),
-    Change("one-element array", "tau", lambda x: np.array([x]), REFUSED),
+    Change("a vector", "tau", lambda x: np.full(3, x), REFUSED),
     Change("an array", "r", lambda x: np.full(4, x), REFUSED),
     Change("whole", "t0", lambda x: 0, 0.0),
     Change("later than the first", "t0", lambda x: 1.5, "any"),
 )  # fmt: skip
-IGNORES = {"kalman": {"tau"}, "ewif": {"q"}, "parallel": {"q"}, "two_sided": {"q"}, "wls": {"q"}, "rts": {"tau"}}
+IGNORES = {
+    "kalman": {"tau"},
+    "ewif": {"q"},
+    "parallel": {"q"},
+    "two_sided": {"q"},
+    "wls": {"q", "tau"},
+    "rts": {"tau"},
+}
 """Parameters that an entry never asks for may be anything."""
 
 
@@ -151,7 +167,9 @@ def _batch(name: str, x: dict[str, Any]) -> Any:
     value = x["value"]
     if isinstance(value, np.ma.MaskedArray):
         value = np.ma.stack([value] * R)
-    elif value is not None and np.asarray(value).dtype != object:
+    elif isinstance(value, list):
+        value = [value] * R
+    elif value is not None:
         value = np.stack([np.asarray(value)] * R)
     stream = stream._replace(value=value)
     trace = ej.run_batch(estimators()[name], params, stream, prior=prior, t0=x["t0"])
@@ -205,7 +223,10 @@ ENTRIES: tuple[tuple[str, str, Callable[[dict[str, Any]], Any]], ...] = (
 
 
 def attempt(seed: int) -> tuple[str, str]:
-    """(kind, what is wrong) of one or two changes to one entry."""
+    """(kind, what is wrong) of one change to one entry, or beyond all of these of one or two."""
+    if seed < len(ENTRIES) * len(CHANGES):
+        which, entry = divmod(seed, len(ENTRIES))
+        return judged(*ENTRIES[entry], [CHANGES[which]])
     rng = np.random.default_rng([seed, 17])
     label, own, call = ENTRIES[rng.integers(len(ENTRIES))]
     chosen = [CHANGES[k] for k in rng.choice(len(CHANGES), rng.integers(1, 3), replace=False)]
@@ -215,6 +236,8 @@ def attempt(seed: int) -> tuple[str, str]:
 
 
 def judged(label: str, own: str, call: Callable[..., Any], chosen: list[Change]) -> tuple[str, str]:
+    if own == "wls":  # its weight is a function of the user
+        chosen = [c for c in chosen if c.field != "tau"]
     given, meant = dict(CLEAN), dict(CLEAN)
     for change in chosen:
         given[change.field] = change.make(CLEAN[change.field])
@@ -222,6 +245,8 @@ def judged(label: str, own: str, call: Callable[..., Any], chosen: list[Change])
             meant[change.field] = change.means
     what = f"{label}: " + " and ".join(f"{c.field} {c.name}" for c in chosen)
     told = [c.means for c in chosen if isinstance(c.means, str) and c.field not in IGNORES[own]]
+    if label.endswith("loss") and any(c.name == "one axis more" for c in chosen):
+        told = ["a batch of one"]  # which a loss takes
     try:
         found = [np.asarray(x) for x in jax.block_until_ready(call(given))]
     except (ValueError, TypeError) as error:
@@ -231,7 +256,7 @@ def judged(label: str, own: str, call: Callable[..., Any], chosen: list[Change])
         if not told and not any(isinstance(c.means, str) for c in chosen):
             return "WRONG", f"{what}: refused, {text[:140]!r}"
         return "refused by name", ""
-    except Exception as error:  # noqa: BLE001 - the attack reports whatever comes
+    except Exception as error:
         return "OBSCURE", f"{what}: {type(error).__name__}: {str(error)[:140]!r}"
     if REFUSED in told:
         return "WRONG", f"{what}: accepted"

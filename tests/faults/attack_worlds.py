@@ -136,7 +136,9 @@ def problem(seed: int, n: int, m: int, sensors: int, steps: int, dtype: Any) -> 
     elif traits["masks"] == "components":
         mask &= rng.random((steps, m)) < 0.7
     value = _values(rng, params, prior, time, sensor, traits["values"])
-    stream = ej.Measurement(time.astype(dtype), np.where(mask, value, 0).astype(dtype), sensor, mask)
+    stream = ej.Measurement(
+        time.astype(dtype), np.where(mask, value, 0).astype(dtype), sensor, mask
+    )
     cast = {k: np.asarray(v) if k == "dead" else np.asarray(v, dtype) for k, v in params.items()}
     prior = ej.Gaussian(*(np.asarray(x, dtype) for x in prior))
     return Problem(cast, stream, prior, traits)
@@ -170,7 +172,12 @@ class Expected(NamedTuple):
 
 
 def filtered(
-    given: Problem, rows: Any, until: float, inflate: Any = None, noisy: bool = True, blur: Any = None
+    given: Problem,
+    rows: Any,
+    until: float,
+    inflate: Any = None,
+    noisy: bool = True,
+    blur: Any = None,
 ) -> Expected:
     """The Kalman estimate at `until` from these rows, in the order of their times.
 
