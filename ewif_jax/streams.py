@@ -180,7 +180,9 @@ def present_values(value: Any, mask: Any) -> Any:
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         hidden, seen = np.ma.getmaskarray(value), checks.known(mask)
         # In a batch all runs may share a mask.
-        fits = seen is not None and np.shape(seen) in (hidden.shape, hidden.shape[1:])
+        if seen is None or seen.dtype != bool:
+            return plain.numbers("measurements.value", value)
+        fits = seen.shape in (hidden.shape, hidden.shape[1:])
         if fits and not (hidden & seen).any():
             value = value.filled(0)
     return plain.numbers("measurements.value", value)
