@@ -113,7 +113,19 @@ def against_oracle(name: str, given: Problem, trace: ej.Trace) -> tuple[int, str
     return compared, ""
 
 
-def same(a: Any, b: Any, where: str, sigma: Any = None) -> str:
+def rows_with_an_answer(given: Problem, trace: ej.Trace) -> int:
+    """How many rows come before one that measures exactly what is known exactly: from there on
+    rounding decides."""
+    used = np.isin(np.asarray(trace.info.status), (Status.USED, Status.LATE_USED))
+    times = np.asarray(given.stream.time, float)
+    for k in np.flatnonzero(used):
+        rows = np.flatnonzero(used[: k + 1])
+        if filtered(given, rows, times[rows].max()).singular:
+            return int(k)
+    return len(times)
+
+
+def same(a: Any, b: Any, where: str) -> str:
     """What differs between two traces by more than rounding."""
     if (np.asarray(a.info.status) != np.asarray(b.info.status)).any():
         return f"{where}: statuses {a.info.status} and {b.info.status}"
