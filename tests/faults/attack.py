@@ -43,7 +43,7 @@ SMALL, SHAPES = (3, 2, 2), ((1, 1, 1), (2, 1, 2), (3, 2, 2), (4, 2, 3), (8, 4, 3
 """(states, components, sensors)."""
 BACKWARD = MAY_FORGET | {"b1", "bl1", "pf_extended"}
 """Whose docstrings ask for motion that can be turned round: they get no dead modes."""
-CI = ("kalman", "square_root", "ewif", "al1", "replay")
+CI = ("kalman", "al1", "replay")
 
 
 class Outcome(NamedTuple):

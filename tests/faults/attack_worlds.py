@@ -15,7 +15,7 @@ import ewif_jax as ej
 def _motion(xp: Any, p: Any, dt: Any) -> Any:
     """F (n, n): real modes `rate` in the axes `basis`; a mode that is `dead` forgets at once."""
     decay = xp.where(p["dead"] & (dt != 0), 0.0, xp.exp(p["rate"] * dt))
-    return (p["basis"] * decay) @ p["inverse"]
+    return (p["basis"] * decay[None, :]) @ p["inverse"]
 
 
 def _integral(xp: Any, rate: Any, dt: Any) -> Any:
