@@ -25,10 +25,18 @@ def known(x: Any) -> np.ndarray | None:
     return None if isinstance(x, Tracer) else np.asarray(x)
 
 
-def with_dtype(x: Any) -> Any:
+def with_dtype(x: Any, argument: str = "measurements") -> Any:
     """`x` if it is an array, else (numbers, lists, columns of tables) as a NumPy array."""
     arrays = Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
-    return x if isinstance(x, arrays) else np.asarray(x)
+    return x if isinstance(x, arrays) else from_rows(argument, x)
+
+
+def from_rows(argument: str, x: Any) -> np.ndarray:
+    """`x` (numbers, lists, columns of tables) as a NumPy array; refuses rows of unequal lengths."""
+    try:
+        return np.asarray(x)
+    except ValueError as error:  # all that NumPy says is that it set an element with a sequence
+        raise ValueError(f"{argument}: expected rows of equal lengths, got {error}") from error
 
 
 def require(condition: Any, argument: str, expected: str, got: Any) -> None:
@@ -115,20 +123,29 @@ def psd(argument: str, x: Any, definite: bool = False) -> Any:
     require(square, argument, "a square matrix", f"shape {value.shape}")
     finite(argument, value)
     spectrum = _spectrum if value.nbytes <= SMALL else _spectrum.__wrapped__
-    scale, skew, smallest = spectrum(value.astype(float).tobytes(), len(value))
+    scale, skew, smallest, apart = spectrum(value.astype(float).tobytes(), len(value))
     require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")
-    good = smallest > 0 if definite else smallest >= -1e-6 * scale
+    # A singular matrix may have eigenvalues above 0 by rounding, of which an inverse is made.
+    eps = np.finfo(value.dtype if value.dtype.kind == "f" else float).eps
+    good = apart > len(value) * eps if definite else smallest >= -1e-6 * scale
     require(good, argument, f"a {kind} matrix", f"smallest eigenvalue {smallest:.3g}")
     return x
 
 
 @lru_cache
-def _spectrum(raw: bytes, n: int) -> tuple[float, float, float]:
-    """The largest element of an (n, n) matrix, its asymmetry, and its smallest eigenvalue."""
+def _spectrum(raw: bytes, n: int) -> tuple[float, float, float, float]:
+    """The largest element of an (n, n) matrix, its asymmetry, its smallest eigenvalue, and that of
+    its correlations, which does not depend on units (0 where a variance is not positive)."""
     value = np.frombuffer(raw).reshape(n, n)
     scale = max(np.abs(value).max(initial=0.0), np.finfo(float).tiny)
     skew = np.abs(value - value.T).max(initial=0.0)
-    return scale, skew, np.linalg.eigvalsh((value + value.T) / 2).min(initial=np.inf)
+    symmetric = (value + value.T) / 2
+    variances, apart = np.diag(value), 0.0
+    if (variances > 0).all():
+        deviations = np.sqrt(variances)
+        correlations = symmetric / deviations[:, None] / deviations
+        apart = np.linalg.eigvalsh(correlations).min(initial=np.inf)
+    return scale, skew, np.linalg.eigvalsh(symmetric).min(initial=np.inf), apart
 
 
 def prior(prior: Gaussian | None, n: int | None = None) -> None:

@@ -75,7 +75,7 @@ def _stamps(argument: str, x: Any) -> Stamps | None:
     if getattr(getattr(x, "dtype", None), "tz", None) is not None:
         return Stamps(np.asarray(x, "datetime64[ns]"), True)
     plain.require_unmasked(argument, x)
-    value = np.asarray(x)
+    value = checks.from_rows(argument, x)
     if value.dtype.kind == "O" and any(isinstance(e, date | timedelta) for e in value.flat):
         return _from_objects(argument, value)
     if value.dtype.kind not in "mM":

@@ -229,10 +229,12 @@ def _worst_prior(prior: Gaussian | None, flags: Any) -> Gaussian | None:
 def _least_definite(cov: np.ndarray, scale: np.ndarray) -> int:
     scaled = cov.astype(float) / scale[:, None, None]
     try:
-        np.linalg.cholesky(scaled)  # several times as fast as the eigenvalues
+        factor = np.linalg.cholesky(scaled)  # several times as fast as the eigenvalues
     except np.linalg.LinAlgError:
         return int(np.argmin(_smallest(scaled)))
-    return 0
+    # What is left of a variance once the others are known: rounding alone where it is singular.
+    left = np.diagonal(factor, axis1=1, axis2=2) ** 2 / np.diagonal(scaled, axis1=1, axis2=2)
+    return int(np.argmin(left.min(1)))
 
 
 def _ranked(fields: Any, ranks: tuple[int, ...]) -> Any:

@@ -36,7 +36,7 @@ def numbers(argument: str, x: Any, missing: bool = False) -> Any:
         require(_real(x.dtype), argument, "real numbers", x.dtype)
         return x
     require_unmasked(argument, x)
-    value = np.asarray(x)
+    value = checks.from_rows(argument, x)
     if value.dtype.kind == "O":
         good = (Real, type(None)) if missing else Real
         strangers = [e for e in value.ravel() if not isinstance(e, good) or isinstance(e, bool)]
@@ -55,7 +55,7 @@ def indices(argument: str, x: Any) -> Any:
     """
     if isinstance(x, Array):
         require(jnp.issubdtype(x.dtype, jnp.integer), argument, "whole numbers", x.dtype)
-    value = checks.known(x)
+    value = checks.known(x if isinstance(x, Array) else checks.from_rows(argument, x))
     if value is None:
         return x.astype(np.int32)
     value = value if value.dtype.kind in "iu" else numbers(argument, x)
@@ -77,7 +77,7 @@ def booleans(argument: str, x: Any) -> Any:
         require(x.dtype == bool, argument, "booleans", x.dtype)
         return x
     require_unmasked(argument, x)
-    value = np.asarray(x)
+    value = checks.from_rows(argument, x)
     if value.dtype.kind == "O":
         strangers = [e for e in value.ravel() if not isinstance(e, bool | np.bool_)]
         require(not strangers, argument, "booleans", Shown(next(iter(strangers), None)))
@@ -101,7 +101,7 @@ def _parameter(path: Any, x: Any) -> Any:
     if isinstance(x, Array | float | int):
         return x
     require_unmasked(f"params{keystr(path)}", x)
-    value = np.asarray(x)
+    value = checks.from_rows(f"params{keystr(path)}", x)
     good = value.dtype.kind not in "OUSMm"
     require(good, f"params{keystr(path)}", "numbers", Shown(x))
     narrow = value.dtype.kind in "iu" and not jax.config.jax_enable_x64  # pyright: ignore

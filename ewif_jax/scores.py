@@ -20,7 +20,7 @@ from ewif_jax import checks
 from ewif_jax.analysis import consistency
 from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.fast.compiling import array
-from ewif_jax.streams import checked_stream, float_dtype
+from ewif_jax.streams import checked_stream, float_dtype, present_values
 from ewif_jax.types import Estimator, Measurement, Status
 
 Score = Callable[[Step, Array, Array], Array]
@@ -118,9 +118,12 @@ def scored(
 
 def as_batch(measurements: Measurement) -> Measurement:
     """A single stream (T, ...) as a batch of one; a batch as it is."""
-    if np.ndim(measurements.value) != 2:
+    ok = isinstance(measurements, Measurement)
+    checks.require(ok, "measurements", "a Measurement", type(measurements).__name__)
+    value = present_values(measurements.value, measurements.mask)
+    if np.ndim(value) != 2:
         return measurements
-    return measurements._replace(value=array(measurements.value)[None])
+    return measurements._replace(value=array(value)[None])
 
 
 @partial(jax.jit, static_argnames="axis", inline=True)

@@ -153,9 +153,9 @@ def given(
     checks.require(ok, "measurements", "a Measurement", type(measurements).__name__)
     time, value, sensor, mask = measurements
     time, t0, times = clocks.in_seconds(time, t0, times)
-    value = _present(value, mask)
-    measurements = Measurement(time, value, plain.native(checks.with_dtype(sensor)), mask)
-    measurements = measurements._replace(mask=checks.with_dtype(mask))
+    sensor = plain.native(checks.with_dtype(sensor, "measurements.sensor"))
+    mask = checks.with_dtype(mask, "measurements.mask")
+    measurements = Measurement(time, present_values(value, mask), sensor, mask)
     checked_stream(measurements, batched)
     if t0 is not None:
         checks.shape("t0", t0, ())
@@ -171,11 +171,19 @@ def given(
     return Given(plain.parameters(params), measurements, prior, t0, times)
 
 
-def _present(value: Any, mask: Any) -> Any:
-    """The values as plain numbers, where nothing that a masked array hides is said to be there."""
+def present_values(value: Any, mask: Any) -> Any:
+    """The values as plain numbers, where nothing that a masked array hides is said to be there.
+
+    Raises:
+        ValueError: what is not numbers, or hidden and said to be present.
+    """
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         hidden, seen = np.ma.getmaskarray(value), checks.known(mask)
-        if seen is not None and np.shape(seen) == hidden.shape and not (hidden & seen).any():
+        # In a batch all runs may share a mask.
+        if seen is None or seen.dtype != bool:
+            return plain.numbers("measurements.value", value)
+        fits = seen.shape in (hidden.shape, hidden.shape[1:])
+        if fits and not (hidden & seen).any():
             value = value.filled(0)
     return plain.numbers("measurements.value", value)
 

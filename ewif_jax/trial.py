@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.tree_util import keystr, tree_leaves_with_path
 
 from ewif_jax import checks, clocks
 from ewif_jax.arrival import arrive, initial
@@ -68,7 +69,11 @@ def validated(
     def tried() -> Any:
         model, stamps = estimator.model, measurements.time
         check_covariances_of(model, params, t0, stamps, measurements.sensor)
-        return jax.eval_shape(first)
+        try:
+            return jax.eval_shape(first)
+        except TypeError as error:  # JAX names the two shapes, but nothing that a caller gave
+            _name_parameters(params, error)
+            raise
 
     state = remembered(question, tried)
     # A factor or information holds any prior: only what keeps a covariance is asked.
@@ -93,6 +98,17 @@ def _require_same_shapes(before: Any, after: Any) -> None:
     same = jax.tree.structure(before) == jax.tree.structure(after) and old == new
     expected = f"values with which a step keeps the shapes of the state, {old}"
     checks.require(same, "params", expected, Shown(new))
+
+
+def _name_parameters(params: Any, error: TypeError) -> None:
+    """Raises in place of `error` of shapes, if some parameter is an array."""
+    shapes = {keystr(path): np.shape(x) for path, x in tree_leaves_with_path(params)}
+    arrays = [f"{name} {shape}" for name, shape in shapes.items() if shape]
+    if arrays and "shape" in str(error):
+        raise ValueError(
+            "params: expected values of the shapes that model and filter compute with, got "
+            f"{', '.join(arrays)}: {error}"
+        ) from error
 
 
 def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable | None:

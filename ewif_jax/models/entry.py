@@ -86,7 +86,8 @@ def check_covariances_of(
     if model is None or any(checks.known(x) is None for x in jax.tree.leaves(given)):
         return
     check = model.check or check_covariances(model.process_cov, model.measurement_cov)
-    start, end = (float(np.max(t)) for t in (t0, times))
+    # NumPy asks an array of JAX for its maximum, which inside a trace is not computed now.
+    start, end = (float(np.max(np.asarray(t))) for t in (t0, times))
     if model.steps is not None:
         end = start + model.steps.dt
     elif not end > start:

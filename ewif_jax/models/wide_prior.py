@@ -42,17 +42,18 @@ def check_prior_width(
     eps = float(jnp.finfo(dtype).eps)
     times, sensors = rows
     with jax.ensure_compile_time_eval():
-        noises = [
-            np.diag(np.asarray(model.measurement_cov(params, s, times[0])))
-            for s in np.unique(sensors)
-        ]
-        noise = np.concatenate(noises).min()
+        seen = [model.measurement_cov(params, s, times[0]) for s in np.unique(sensors)]
+        if any(checks.known(R) is None for R in seen):
+            return True  # a model that was built inside a trace holds what is not known yet
+        noise = np.concatenate([np.diag(np.asarray(R)) for R in seen]).min()
         gap = np.diff(times, prepend=float(t0)).max()
         if not np.diag(cov).max() * max(1.0, gap) ** 2 * eps > LIMIT / 10 * noise:
             return True  # a look without a program of its own: most priors are far from the limit
         stamps = np.append(float(t0), times).astype(dtype)
         mean = jnp.asarray(prior.mean, dtype)
         matrices = _matrices(model, params, mean, stamps[:-1], stamps[1:], sensors)
+    if any(checks.known(x) is None for x in matrices):
+        return True
     share = _rounding(cov, [np.asarray(x, float) for x in matrices], eps)
     checks.require(
         share <= LIMIT,
