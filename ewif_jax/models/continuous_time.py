@@ -16,6 +16,7 @@ from ewif_jax.models.discrete import Stride, pattern_of_powers, then
 from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
 from ewif_jax.models.parameters import named
 from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.recipe import from_recipe
 
 TERMS = 19
 """Of each series: what is left out is below 1 / 20! where the norm of A dt is at most 1/2."""
@@ -23,6 +24,7 @@ HALVINGS = 40
 """How often an interval is halved, at most: enough for a norm of A dt of 5e11."""
 
 
+@from_recipe
 def from_continuous(
     A: Any,
     G: Any,
