@@ -77,7 +77,8 @@ from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
 from ewif_jax.parallel import run_parallel
 from ewif_jax.smoothers.batch_wls import batch_wls
-from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
+from ewif_jax.smoothers.fixed_lag import fixed_lag
+from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 from ewif_jax.smoothers.rts import rts
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif

@@ -11,8 +11,8 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
-from ewif_jax.estimators.ewif import ewif
-from ewif_jax.models.model import Model, resolve
+from ewif_jax.estimators.ewif import ewif, growth
+from ewif_jax.models.model import Model
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions import passage as way
 from ewif_jax.recursions.information import InformationState
@@ -107,10 +107,7 @@ def _run_parallel(
     cut = partial(_blocks_last, blocks=blocks)
     arrivals, reports = jax.tree.map(cut, (measurements, padded[1]))
 
-    def squared(params: Any, t_from: Array, t_to: Array) -> Array:
-        if weight is not None:
-            return jnp.square(weight(params, t_from, t_to))
-        return jnp.exp((t_from - t_to) / resolve(tau, params))
+    growing = growth(tau, weight)
 
     def from_nothing(time: Array) -> Stretch:
         return form.start(model, params, None, time), way.standstill(start.mean.shape[0], dtype)
@@ -118,12 +115,12 @@ def _run_parallel(
     def lengthen(stretch: Stretch, measurement: Measurement) -> Stretch:
         state, passed = stretch
         kept = arrive(estimator, params, state, measurement).kept
-        leg = way.passage(model, params, squared, state.time, kept.time, dtype)
+        leg = way.passage(model, params, growing, state.time, kept.time, dtype)
         return kept, way.then(passed, leg)
 
     def after(state: InformationState, stretch: Stretch) -> InformationState:
         own, passed = stretch
-        return form.recentred(way.joined(way.carried(state, passed, own.time), own))
+        return form.recentred(form.joined(way.carried(state, passed, own.time), own))
 
     def filtered(state: InformationState, arrival: tuple[Measurement, Any]) -> tuple[Any, Any]:
         measurement, time = arrival
@@ -162,9 +159,11 @@ def _carried_in(
         none = seconds[0].time.size == 0  # the prefix sum of two asks for this
         return seconds if none else jax.vmap(together)(firsts, seconds)
 
-    nothing_before = start, way.standstill(start.mean.shape[0], start.mean.dtype)
+    vague = stretches[0].vague  # as everything of which a prefix sum is made
+    still = way.standstill(start.mean.shape[0], start.mean.dtype)
+    nothing_before = start._replace(vague=vague), still
     links = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), nothing_before, stretches)
-    return lax.associative_scan(pairwise, links)[0]
+    return lax.associative_scan(pairwise, links)[0]._replace(vague=start.vague)
 
 
 def _padded(x: Array, to: int) -> Array:

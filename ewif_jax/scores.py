@@ -166,15 +166,24 @@ def _used(step: Step) -> Array:
 def _where_used(step: Step, score: Array) -> Array:
     """`score` of a measurement that was used and predicted, otherwise NaN; infinite where
     variances or densities are none."""
-    said = jnp.all(jnp.isfinite(step.info.innovation)) & ~jnp.isnan(step.info.log_likelihood)
+    log_likelihood = step.info.log_likelihood
+    said = jnp.all(jnp.isfinite(step.info.innovation)) & ~jnp.isnan(log_likelihood)
     kept = jnp.where(jnp.isnan(score), jnp.inf, score)
-    return jnp.where(_used(step), jnp.where(said, kept, _silent_or_broken(step)), jnp.nan)
+    # What is not predicted has log likelihood 0 if nothing is known; else it is -inf or NaN.
+    silent = jnp.where(jnp.isfinite(log_likelihood), _silent_or_broken(step), jnp.inf)
+    return jnp.where(_used(step), jnp.where(said, kept, silent), _silent_or_broken(step))
 
 
 def _silent_or_broken(step: Step) -> Array:
-    """Where there is no number: NaN if nothing is known (the likelihood says so by 0), infinity if
-    what came is outside of its domain (it is -inf or NaN)."""
-    return jnp.where(jnp.isfinite(step.info.log_likelihood), jnp.nan, jnp.inf)
+    """Where there is no number: infinity if what came is outside of its domain (a covariance of the
+    innovation that is NaN is refused), else NaN.
+
+    The likelihood would say so too, but every run would have to compute it for an RMSE; this
+    covariance all runs share.
+    """
+    is_broken = jnp.any(jnp.isnan(step.info.innovation_cov))
+    is_broken &= step.info.status == Status.REJECTED
+    return jnp.where(is_broken, jnp.inf, jnp.nan)
 
 
 def _square(step: Step) -> Array:

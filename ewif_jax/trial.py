@@ -81,7 +81,8 @@ def validated(
         and hasattr(getattr(state, "current", state), "cov")
     ):
         asked = _question(estimator, setting, (params, prior, t0, rows))
-        remembered(asked, lambda: check_prior_width(model, params, prior, t0, rows, dtype))
+        if asked is not None:  # else something is traced
+            remembered(asked, lambda: check_prior_width(model, params, prior, t0, rows, dtype))
     return state
 
 

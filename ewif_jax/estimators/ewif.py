@@ -12,9 +12,9 @@ from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
-from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 @from_recipe
@@ -42,8 +42,14 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
     `init` accepts `prior=None` (nothing is known about the state): `estimate` is then NaN until
     the measurements determine the state to rounding, and the log likelihood of the measurements up
     to there is 0. A prior counts as a measurement of the whole state at t0 and decays like one.
-    After a gap so long that the weights underflow the estimate is NaN again, until new
-    measurements determine the state.
+    Once determined it stays so: after a gap of any length the variances are large, at most the root
+    of the largest number, and new measurements replace what is old. A state that the motion makes
+    certain (stable, and faster than information decays) is known with a variance down to rounding
+    of its component.
+
+    A measurement without noise (a singular R) is refused if R is known, else `REJECTED`: an R that
+    tends to 0 still weights such measurements among themselves. So is one whose way back has no
+    finite numbers.
 
     Reduces to: `kalman` without process noise as tau grows; `fading` with inflation exp(dt / tau)
         and Q = 0; least squares over all the data (8)-(9).
@@ -53,7 +59,8 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         which is not the covariance of the error under its model (3).
 
     Raises:
-        ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear.
+        ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear; a
+            singular R; a constant F without inverse.
     """
     need_linear(model, "ewif")
     need_reversible(model, "ewif")
@@ -62,35 +69,47 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
     if tau is not None and not callable(tau):
         checks.positive("tau", tau)
 
-    def squared(params: Any, measured: Array, at: Array) -> Array:
-        if weight is not None:
-            return jnp.square(weight(params, measured, at))
-        decay = checks.positive("tau", resolve(tau, params))
-        return jnp.exp((measured - at) / decay)
-
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> InformationState:
+    def start(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> InformationState:
         del key
         if tau is not None:
             checks.positive("tau", resolve(tau, params))
-        return form.start(model, params, prior, t0)
+        form.refuse_exact(model, params, t0, "ewif")
+        form.refuse_one_way(model, params, "ewif")
+        return form.start(model, params, prior, t0, None if weight is None else ())
 
-    def predict(params: Any, state: InformationState, time: Array) -> InformationState:
-        time = jnp.asarray(time, state.time.dtype)
-        w2 = jnp.asarray(squared(params, state.time, time), state.mean.dtype)
-        return form.transport(model, params, state, time, w2)
+    growing = growth(tau, weight)
 
-    def update(
+    def move(params: Any, state: InformationState, time: Array) -> InformationState:
+        return form.transport(model, params, state, time, growing(params, state.time, time))
+
+    def measure(
         params: Any, state: InformationState, measurement: Measurement
     ) -> tuple[InformationState, Info]:
-        present = jnp.any(measurement.mask)
-        w2 = jnp.asarray(squared(params, measurement.time, state.time), state.mean.dtype)
-        updated, info = form.absorb(model, params, state, measurement, w2)
-        late = measurement.time < state.time
-        status = verdict(late, present, Status.LATE_USED)
-        return updated, info._replace(status=status)
+        faded = growing(params, measurement.time, state.time)
+        return form.absorb(model, params, state, measurement, faded)
 
     def estimate(params: Any, state: InformationState) -> Gaussian:
         del params
-        return form.settled(state)
+        return form.estimate(state)
 
-    return Estimator(init, predict, update, estimate, model=without_process_noise(model))
+    def any_time(params: Any, state: InformationState, time: Array) -> Array:
+        del params, state
+        return jnp.isfinite(time)
+
+    recursion = Recursion("ewif", start, move, measure, estimate, any_time)
+    recursion = recursion._replace(moves_back=True, starts_from_nothing=True, keeps=True)
+    return estimator_from(recursion._replace(model=without_process_noise(model)))
+
+
+def growth(tau: Any, weight: Callable[..., Array] | None) -> Callable[[Any, Array, Array], Array]:
+    """What variances of time t count at time `now`: (params, t, now) -> 1 / W(t, now)^2."""
+
+    def by_weight(params: Any, measured: Array, now: Array) -> Array:
+        assert weight is not None
+        return form.reciprocal_square(jnp.asarray(weight(params, measured, now), now.dtype))
+
+    def by_decay(params: Any, measured: Array, now: Array) -> Array:
+        decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), now.dtype)
+        return form.exponential(now - measured, decay)
+
+    return by_decay if weight is None else by_weight

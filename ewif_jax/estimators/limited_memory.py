@@ -1,5 +1,6 @@
 """The limited-memory filter: least squares over a sliding window."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -7,15 +8,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels.trees import choose
 from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
-from ewif_jax.recursions.contract import verdict
+from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
 class WindowState(NamedTuple):
@@ -59,10 +59,11 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     if not callable(window):
         checks.positive("window", window)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> WindowState:
+    def first_state(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> WindowState:
         del key
         checks.positive("window", resolve(window, params))
-        start = form.start(model, params, prior, t0)
+        form.refuse_exact(model, params, t0, "limited_memory")
+        start = form.start(model, params, prior, t0, ())
         # As an argument: a table of NumPy cannot be indexed while tracing.
         m = jax.eval_shape(
             lambda own: jnp.asarray(linear.H(own, jnp.zeros((), jnp.int32), start.time)), params
@@ -76,55 +77,42 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         return WindowState(start.time, start, buffer)
 
     def fit(params: Any, state: WindowState, time: Array) -> InformationState:
-        """Everything inside the window, at `time`, refined once against rounding."""
+        """Everything inside the window, at `time`."""
         half = resolve(window, params)
         inside = jnp.abs(time - state.start.time) <= half
-        weight, there = jnp.where(inside, 1.0, 0.0), time
-        if model.steps is not None:  # what does not count may be too many steps away
-            there = jnp.where(inside, time, state.start.time)
-        base = form.transport(model, params, state.start, there, weight)._replace(time=time)
+        counted = jnp.where(inside, state.start.variances, jnp.inf)
+        base = state.start._replace(variances=counted)
+        base = form.transport(model, params, base, jnp.where(inside, time, base.time), 1.0)
+        base = base._replace(time=time)
         stamps = state.buffer.time
         near = jnp.abs(time - stamps) <= half
         safe = state.buffer._replace(
             time=jnp.where(near, stamps, time), mask=state.buffer.mask & near[:, None]
         )
+        told, targets, noise = jax.vmap(partial(form.contribution, model, params, base))(safe)
+        flat = told.reshape(-1, told.shape[-1]), noise.ravel(), targets.ravel()
+        return form.recentred(form.gathered(base, *flat))
 
-        def gather(around: InformationState) -> InformationState:
-            parts = jax.vmap(lambda one: form.contribution(model, params, around, one))(safe)
-            return around._replace(
-                matrix=base.matrix + jnp.sum(parts[0], 0),
-                vector=base.vector
-                + form.times(base.matrix, base.mean - around.mean)
-                + jnp.sum(parts[1], 0),
-            )
-
-        once = form.recentred(gather(base))
-        return gather(once._replace(vector=jnp.zeros_like(once.vector)))
-
-    def predict(params: Any, state: WindowState, time: Array) -> WindowState:
+    def move(params: Any, state: WindowState, time: Array) -> WindowState:
         del params
-        return state._replace(time=jnp.asarray(time, state.time.dtype))
+        return state._replace(time=time)
 
-    def update(
+    def is_inside(params: Any, state: WindowState, time: Array) -> Array:
+        in_window = state.time - time <= resolve(window, params)
+        return in_window & (time >= jnp.min(state.buffer.time))
+
+    def measure(
         params: Any, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
-        present = jnp.any(measurement.mask)
         oldest = jnp.argmin(state.buffer.time)
-        out = (state.time - measurement.time > resolve(window, params)) | (
-            measurement.time < state.buffer.time[oldest]
-        )
-        used = present & ~out
         buffer = jax.tree.map(lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement)
         before = fit(params, state, state.time)
         _, info = form.absorb(model, params, before, measurement, 1.0)
-        late = jnp.where(out, Status.TOO_LATE, Status.LATE_USED)
-        info = info._replace(
-            log_likelihood=jnp.where(used, info.log_likelihood, 0),
-            status=verdict(measurement.time < state.time, present, late),
-        )
-        return choose(used, state._replace(buffer=buffer), state), info
+        return state._replace(buffer=buffer), info
 
     def estimate(params: Any, state: WindowState) -> Gaussian:
         return form.estimate(fit(params, state, state.time))
 
-    return Estimator(init, predict, update, estimate, model=without_process_noise(model))
+    recursion = Recursion("limited_memory", first_state, move, measure, estimate, is_inside)
+    recursion = recursion._replace(moves_back=True, starts_from_nothing=True)
+    return estimator_from(recursion._replace(model=without_process_noise(model)))

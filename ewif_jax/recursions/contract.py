@@ -113,14 +113,20 @@ def estimator_from(recursion: Recursion) -> Estimator:
         """A measurement within reach, or one of which nothing is present."""
         updated, info = measure(params, state, measurement)
         present, late = jnp.any(measurement.mask), measurement.time < state.time
-        accepted = info.status != Status.REJECTED
+        accepted = changed = info.status != Status.REJECTED
+        likelihood = jnp.where(accepted, info.log_likelihood, 0)
+        # Parameters outside of their domain make NaN of Q or R, and so of all that follows. What
+        # starts from nothing also says by NaN that nothing is known; it refuses the former.
+        is_broken = ~jnp.all(jnp.isfinite(info.innovation_cov))
+        if recursion.starts_from_nothing:
+            is_broken &= ~accepted
+        likelihood = jnp.where(is_broken, -jnp.inf, likelihood)
+        accepted, changed = accepted & ~is_broken, accepted | is_broken
         used = jnp.where(late, Status.LATE_USED, Status.USED)
         status = jnp.where(accepted, used, Status.REJECTED)
         status = jnp.where(present, status, Status.MASKED).astype(jnp.int32)
-        info = info._replace(
-            log_likelihood=jnp.where(present & accepted, info.log_likelihood, 0), status=status
-        )
-        return (updated if recursion.keeps else choose(present & accepted, updated, state)), info
+        info = info._replace(log_likelihood=jnp.where(present, likelihood, 0), status=status)
+        return (updated if recursion.keeps else choose(present & changed, updated, state)), info
 
     def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
         in_sequence = measurement.time >= state.time

@@ -1,73 +1,187 @@
-"""Information form: an information matrix around a reference mean.
+"""Information form: what is known, as equations about the distance from a reference mean.
 
-The estimate is mean + matrix^-1 vector. Keeping the vector relative to a reference that follows
-the estimate (instead of the absolute matrix x mean) is what keeps float32 accurate, and a matrix
-that is still singular needs no special case.
+The state is x = mean + d, and equation k says T_k d = targets_k with an error of variance
+variances_k: the information matrix is T' diag(1 / variances) T with a unit upper triangular T
+(`kernels.equations`). A direction about which nothing is known has an infinite variance and needs
+no special case; a precise and a vague one live side by side in float32; nothing that was known is
+ever unknown again. The targets keep what re-centring leaves over, rounding of the mean included:
+far from the origin that is more than what one measurement changes.
 """
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.fast.batched import kernel, largest, total
+from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.fast.sparse import transposed
-from ewif_jax.kernels import cholesky, gaussian, symmetric
+from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import affine_flow, observation, patterns, size
-from ewif_jax.types import Gaussian, Info, Measurement
+from ewif_jax.types import Gaussian, Info, Measurement, Status
 
 
 class InformationState(NamedTuple):
-    """time (), mean (n,): the reference, matrix: upper triangle of the information matrix,
-    vector (n,): information times (estimate - mean), zero as soon as the matrix has full rank."""
+    """time (), mean (n,): the reference, variances (n,), rows (n (n - 1) / 2,), targets (n,): the
+    equations, vague: () if something may be unknown yet, None if the prior said of everything
+    something (a difference in structure, so that a program without unknowns has no code for them).
+    """
 
     time: Array
     mean: Array
-    matrix: Array
-    vector: Array
+    variances: Array
+    rows: Array
+    targets: Array
+    vague: tuple[()] | None = None
+
+    @property
+    def matrix(self) -> Array:
+        """The upper triangle of the information matrix, row by row."""
+        T = equations.upper(self.rows)
+        return symmetric.pack(T.T @ (T / self.variances[:, None]))
 
 
-def start(model: Model, params: Any, prior: Gaussian | None, t0: Any) -> InformationState:
-    """The state that knows the prior, or nothing."""
+def start(
+    model: Model, params: Any, prior: Gaussian | None, t0: Any, vague: tuple[()] | None = None
+) -> InformationState:
+    """The state that knows the prior, or nothing; `vague` () if the prior may be forgotten."""
     checks.prior(prior)
     if prior is None:
         t0 = jnp.asarray(t0)
         t0 = t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
         nothing = jnp.zeros(size(model, params, t0), t0.dtype)
-        return InformationState(t0, nothing, symmetric.pack(jnp.diag(nothing)), nothing)
+        return InformationState(t0, nothing, *_unknown(nothing), ())
     checks.psd("prior.cov", prior.cov, definite=True)
     mean = jnp.asarray(prior.mean)
-    matrix = cholesky.inverse(cholesky.factor(jnp.asarray(prior.cov, mean.dtype)))
+    lower = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
+    variances, rows = equations.spread(lower, jnp.ones_like(mean))
     return InformationState(
-        jnp.asarray(t0, mean.dtype), mean, symmetric.pack(matrix), jnp.zeros_like(mean)
+        jnp.asarray(t0, mean.dtype), mean, variances, rows, jnp.zeros_like(mean), vague
     )
 
 
 def transport(
-    model: Model, params: Any, state: InformationState, time: Array, weight: Array | float
+    model: Model,
+    params: Any,
+    state: InformationState,
+    time: Array,
+    growth: Array | float,
+    noise: Array | None = None,
 ) -> InformationState:
-    """The state at `time` without process noise: information times `weight`, in either direction.
-
-    matrix <- weight A' matrix A and vector <- weight A' vector, with A from `time` back to the
-    state's time.
-    """
+    """The state at `time`, in either direction: variances times `growth`, plus those of `noise`
+    (n, n), a matrix L of which L L' is the process noise (at `time`)."""
     dtype = state.mean.dtype
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
-    A, _ = affine_flow(model, params, time, state.time, dtype)
-    F_where, _ = patterns(model)
-    back = transposed(F_where)
-    mean = matvec(F, state.mean, F_where)
-    return InformationState(
-        time,
-        mean if c is None else mean + c,
-        weight * symmetric.congruence(A.T, state.matrix, back),
-        weight * matvec(A.T, state.vector, back),
-    )
+    where = patterns(model)[0]
+    mean = matvec(F, state.mean, where)
+    mean = mean if c is None else mean + c
+    faded = state._replace(time=time, variances=grown(state.variances, growth))
+    if noise is None and where is not None and equations.is_upper(where):
+        back, _ = affine_flow(model, params, time, state.time, dtype)
+        rows, diagonal = equations.carried(faded.rows, back, where)
+        return faded._replace(
+            mean=mean,
+            variances=_over(faded.variances, diagonal),
+            rows=rows,
+            targets=faded.targets / diagonal,
+        )
+    back = None
+    if state.vague is not None:
+        back, _ = affine_flow(model, params, time, state.time, dtype)
+    return moved(faded, F, back, noise)._replace(mean=mean)
+
+
+def moved(
+    state: InformationState, ahead: Array, back: Array | None, noise: Array | None = None
+) -> InformationState:
+    """The equations of a state whose reference has moved by `ahead` (n, n); `back`, its inverse, is
+    needed only while something is unknown.
+
+    What is known of everything moves as a covariance, with no way back: there a motion that is
+    stable and fast makes the certain more certain, and takes nothing from the rest.
+    """
+    n = state.mean.shape[0]
+    variances = jnp.where(jnp.isinf(state.variances), 1, state.variances)
+    vectors = matmul(ahead, equations.inverse(state.rows))
+    error = matvec(vectors, state.targets)
+    if noise is None:
+        kept, rows = equations.spread(vectors, variances)
+    else:
+        both = jnp.concatenate([variances, jnp.ones_like(variances)])
+        kept, rows = equations.spread(jnp.concatenate([vectors, noise], 1), both)
+    targets = equations.times(rows, error)
+    certain = state._replace(variances=kept, rows=rows, targets=targets)
+    if state.vague is None:
+        return certain
+    assert back is not None
+    usable = jnp.all(jnp.isfinite(back))
+    back = jnp.where(usable, back, jnp.eye(n, dtype=back.dtype))
+    told = matmul(equations.upper(state.rows), back)
+    spreads = jnp.where(usable, state.variances, jnp.inf)
+    if noise is None:
+        partial = gathered(state._replace(**_nothing(state.mean)), told, spreads, state.targets)
+    else:
+        # Of (u, x) with noise L u, u of unit variance: u is eliminated by coming first.
+        eye, zeros = jnp.eye(n, dtype=back.dtype), jnp.zeros((n, n), back.dtype)
+        wide = jnp.concatenate(
+            [jnp.concatenate([eye, zeros], 1), jnp.concatenate([-matmul(told, noise), told], 1)]
+        )
+        none = jnp.zeros(2 * n, back.dtype)
+        both = gathered(
+            state._replace(mean=none, **_nothing(none)),
+            wide,
+            jnp.concatenate([jnp.ones_like(spreads), spreads]),
+            jnp.concatenate([jnp.zeros_like(state.targets), state.targets]),
+        )
+        partial = state._replace(
+            variances=both.variances[n:],
+            rows=both.rows[both.rows.shape[0] - state.rows.shape[0] :],
+            targets=both.targets[n:],
+        )
+    return choose_known(determined(state), certain, partial)
+
+
+def gathered(
+    state: InformationState, told: Array, variances: Array, targets: Array
+) -> InformationState:
+    """The state with further equations (k, n), their variances (k,) and targets (k,), around the
+    same reference."""
+
+    def add(known: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[Any, None]:
+        equation, variance, target = new
+        kept, rows, answers = known
+        kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance)
+        return (kept, rows, equations.answered(answers, target, leads, steps)), None
+
+    before = state.variances, state.rows, state.targets
+    (kept, rows, answers), _ = lax.scan(add, before, (told, variances, targets))
+    return state._replace(variances=kept, rows=rows, targets=answers)
+
+
+def joined(a: InformationState, b: InformationState) -> InformationState:
+    """The information of two states of one time together, around a's mean if `a` determines one
+    (else around b's), which keeps the targets short."""
+    mean = jnp.where(determined(a), a.mean, b.mean)
+    around = recentred_on(a, mean)
+    other = recentred_on(b, mean)
+    return gathered(around, equations.upper(b.rows), b.variances, other.targets)
+
+
+def recentred_on(state: InformationState, mean: Array) -> InformationState:
+    """The same information around another reference."""
+    shift = state.mean - mean
+    return state._replace(mean=mean, targets=state.targets + equations.times(state.rows, shift))
+
+
+def blended(old: InformationState, new: InformationState, share: Array) -> InformationState:
+    """(1 - share) times the information of `old` and `share` times that of `new`."""
+    parts = (old, 1 - share), (new, share)
+    faded = [s._replace(variances=grown(s.variances, _reciprocal(part))) for s, part in parts]
+    return recentred(joined(*faded))
 
 
 def absorb(
@@ -75,59 +189,168 @@ def absorb(
     params: Any,
     state: InformationState,
     measurement: Measurement,
-    weight: Array | float,
+    growth: Array | float,
+    exact: bool = False,
 ) -> tuple[InformationState, Info]:
-    """The state with a measurement of any time, its information times `weight`; `Info.status` is
-    left at 0 for the caller to set."""
+    """The state with a measurement of any time, its R times `growth`, and its `Info`: one seen
+    through a motion that has no way back, or (unless `exact`) without noise, is REJECTED."""
     seen, difference, R = _sight(model, params, state, measurement)
-    matrix, vector = _gained(seen, difference, R, measurement.mask)
-    updated = recentred(
-        state._replace(matrix=state.matrix + weight * matrix, vector=state.vector + weight * vector)
-    )
-    return updated, _info(state, seen, difference, R, measurement, weight)
+    mask = measurement.mask
+    # No value decides here: runs that differ only in their values share what is not the targets.
+    noise, good = _noise(gaussian.mask_cov(R, mask), seen, exact)
+    used = good & jnp.any(mask)
+    usable, residual = jnp.where(good, seen, 0), jnp.where(good, difference, 0)
+    told, apart = cholesky.forward(noise.unit, usable), cholesky.forward(noise.unit, residual)
+    spreads = jnp.where(used & mask, noise.variances * growth, jnp.inf)
+    variances, rows, targets = state.variances, state.rows, state.targets
+    for k in range(mask.shape[0]):  # apart from the targets it depends on no data: runs share it
+        variances, rows, leads, steps = equations.absorbed(
+            variances, rows, told[k], spreads[k], state.vague is not None
+        )
+        targets = equations.answered(targets, apart[k], leads, steps)
+    updated = state._replace(variances=variances, rows=rows, targets=targets)
+    info = _info(state, usable, residual, R * growth, measurement, good)
+    # Variances outside of their domain are NaN here, and nothing is known from then on.
+    is_broken = jnp.any(jnp.isnan(gaussian.mask_cov(R, mask)))
+    updated = recentred(updated, used)
+    return updated._replace(mean=jnp.where(is_broken, jnp.nan, updated.mean)), info
 
 
 def contribution(
     model: Model, params: Any, state: InformationState, measurement: Measurement
-) -> tuple[Array, Array]:
-    """Packed information matrix and vector (around the reference) of one measurement alone."""
+) -> tuple[Array, Array, Array]:
+    """What one measurement says, as equations for `gathered`: whitened (m, n), targets (m,), and
+    variances (m,), infinite where nothing is said."""
     seen, difference, R = _sight(model, params, state, measurement)
-    return _gained(seen, difference, R, measurement.mask)
+    mask = measurement.mask
+    noise, good = _noise(gaussian.mask_cov(R, mask), seen)
+    told = cholesky.forward(noise.unit, jnp.where(good, seen, 0))
+    targets = cholesky.forward(noise.unit, jnp.where(good, difference, 0))
+    return told, targets, jnp.where(good & mask, noise.variances, jnp.inf)
 
 
-def times(packed: Array, x: Array) -> Array:
-    """A packed matrix times a vector."""
-    return symmetric.times(packed, x)
+def determined(state: InformationState) -> Array:
+    """Whether something is known about every direction."""
+    if state.vague is None:
+        return jnp.ones((), bool)
+    return largest(state.variances) < jnp.inf
 
 
-def recentred(state: InformationState) -> InformationState:
+def recentred(state: InformationState, used: Array | bool = True) -> InformationState:
     """The same information around the estimate, if there is one."""
-    cov, full_rank = symmetric.inverse(state.matrix)
-    shift = symmetric.times(cov, state.vector)
-    return state._replace(
-        mean=jnp.where(full_rank, state.mean + shift, state.mean),
-        vector=jnp.where(full_rank, 0, state.vector),
-    )
+    shift = equations.solved(state.rows, state.targets)
+    shift = jnp.where(determined(state) & used, shift, 0)
+    mean = state.mean + shift
+    made = mean - state.mean  # what rounding lets the mean move by
+    return state._replace(mean=mean, targets=state.targets - equations.times(state.rows, made))
 
 
 def estimate(state: InformationState) -> Gaussian:
-    """Mean and covariance; NaN while the information matrix is not of full rank."""
-    cov, full_rank = symmetric.inverse(state.matrix)
-    mean = state.mean + symmetric.times(cov, state.vector)
+    """Mean and covariance of a state that is `recentred` whenever there is an estimate: the
+    reference; NaN while something is unknown."""
+    known = determined(state)
+    variances = jnp.where(known, state.variances, 1)
+    cov = equations.covariance(equations.inverse(state.rows), variances)
     return Gaussian(
-        jnp.where(full_rank, mean, jnp.nan),
-        jnp.where(full_rank, symmetric.unpack(cov), jnp.nan),
+        jnp.where(known, state.mean, jnp.nan),
+        symmetric.unpack(jnp.where(known, cov, jnp.nan)),
     )
 
 
-def settled(state: InformationState) -> Gaussian:
-    """The estimate of a state that is `recentred` whenever there is one: the reference itself."""
-    cov, full_rank = symmetric.inverse(state.matrix)
-    centred = full_rank & (largest(jnp.abs(state.vector)) == 0)
-    return Gaussian(
-        jnp.where(centred, state.mean, jnp.nan),
-        jnp.where(full_rank, symmetric.unpack(cov), jnp.nan),
+def grown(variances: Array, growth: Array | float) -> Array:
+    """Variances times `growth`, but no larger than the root of the largest number.
+
+    So what was known never becomes nothing, its derivatives stay finite, and the prediction after
+    any gap is still one. What is infinite, or grows without bound at once, becomes infinite.
+    """
+    growth = jnp.asarray(growth, variances.dtype)
+    ceiling = float(np.sqrt(float(jnp.finfo(variances.dtype).max)))
+    fits = variances <= ceiling / growth
+    larger = jnp.where(fits, variances, 0) * jnp.where(fits, growth, 1)
+    larger = jnp.where(fits, larger, jnp.maximum(lax.stop_gradient(variances), ceiling))
+    return jnp.where(jnp.isfinite(growth) & ~jnp.isinf(variances), larger, growth + variances)
+
+
+def exponential(age: Array, tau: Array) -> Array:
+    """exp(age / tau), saturated where its square would overflow (either way), with derivatives."""
+    dtype = jnp.result_type(age, tau)
+    most = 0.5 * float(np.log(float(jnp.finfo(dtype).max)))
+    return jnp.exp(jnp.clip(age / tau, -most, most))
+
+
+def reciprocal_square(weight: Array) -> Array:
+    """1 / weight^2, infinite for a weight of zero and saturated for one that is very small."""
+    square = jnp.square(weight)
+    return jnp.where(square == 0, jnp.inf, _reciprocal(square))
+
+
+def refuse_exact(model: Model, params: Any, t0: Any, method: str) -> None:
+    """Refuses a known R that is not positive definite."""
+    for sensor in range(model.sensors or 1):
+        with jax.ensure_compile_time_eval():
+            R = checks.known(model.measurement_cov(params, np.int32(sensor), t0))
+        if R is None or R.ndim != 2 or R.shape[0] != R.shape[1]:
+            continue
+        R = R.astype(float)
+        diagonal = np.diagonal(R)
+        name = "R" if (model.sensors or 1) == 1 else f"R of sensor {sensor}"
+        good = bool(np.all(diagonal > 0) and np.all(np.isfinite(R)))
+        smallest = float(np.min(diagonal, initial=np.inf))
+        if good:
+            scale = np.sqrt(diagonal)
+            smallest = float(np.linalg.eigvalsh(R / scale[:, None] / scale).min(initial=np.inf))
+            good = smallest > 8 * len(R) * np.finfo(np.float32).eps * 1e-6
+        checks.require(
+            good,
+            name,
+            f"a positive definite covariance: {method} adds up R^-1, which an exact measurement "
+            "has not (kalman, information, fading, square_root, al1 and the like take one; or "
+            "give it a small variance)",
+            f"smallest eigenvalue {smallest:.3g}",
+        )
+
+
+def refuse_one_way(model: Model, params: Any, method: str) -> None:
+    """Refuses a known F that has no inverse."""
+    linear = model.linear
+    if linear is None or linear.F_where is None:
+        return
+    with jax.ensure_compile_time_eval():
+        back = checks.known(linear.F(params, jnp.ones(()), jnp.zeros(())))
+    checks.require(
+        back is None or not np.isnan(back).any(),
+        "F",
+        f"a matrix that has an inverse: {method} moves what is known back in time (kalman, fading "
+        "and square_root do not)",
+        "a singular one",
     )
+
+
+def _reciprocal(x: Array) -> Array:
+    """1 / x, saturated like `grown`."""
+    most = float(np.sqrt(float(jnp.finfo(x.dtype).max)))
+    usable = x > 1 / most
+    return jnp.where(usable, 1 / jnp.where(usable, x, 1), jnp.where(jnp.isnan(x), x, most))
+
+
+def _over(variances: Array, diagonal: Array) -> Array:
+    return grown(variances, 1 / jnp.square(diagonal))
+
+
+def _unknown(nothing: Array) -> tuple[Array, Array, Array]:
+    n = nothing.shape[0]
+    return jnp.full_like(nothing, jnp.inf), jnp.zeros(n * (n - 1) // 2, nothing.dtype), nothing
+
+
+def _nothing(like: Array) -> dict[str, Array]:
+    return dict(zip(("variances", "rows", "targets"), _unknown(jnp.zeros_like(like)), strict=True))
+
+
+def choose_known(
+    known: Array, certain: InformationState, partial: InformationState
+) -> InformationState:
+    """`certain` where everything is known, else `partial`."""
+    return jax.tree.map(lambda a, b: jnp.where(known, a, b), certain, partial)
 
 
 def _sight(
@@ -149,24 +372,25 @@ def _sight(
     return seen, jnp.where(mask, difference, 0), R
 
 
-def _gained(seen: Array, difference: Array, R: Array, mask: Array) -> tuple[Array, Array]:
-    noise = cholesky.factor(gaussian.mask_cov(R, mask))
-    rows = cholesky.forward(noise, seen)
-    # Apart from the vector, the matrix depends on no data: a batch of runs may share it.
-    return _squares(rows), _products(rows, cholesky.forward(noise, difference))
+class _Noise(NamedTuple):
+    """R = L diag(variances) L': the unit lower triangular L, and variances (m,)."""
+
+    unit: cholesky.Factor
+    variances: Array
 
 
-@kernel
-def _squares(rows: Array) -> Array:
-    """rows' rows, packed."""
-    i, j = np.triu_indices(rows.shape[1])
-    return total(r[i] * r[j] for r in rows)
-
-
-@kernel
-def _products(rows: Array, target: Array) -> Array:
-    """rows' target."""
-    return total(r * t[None] for r, t in zip(rows, target, strict=True))
+def _noise(R: Array, seen: Array, exact: bool = False) -> tuple[_Noise, Array]:
+    """R taken apart, and whether the measurement is any good."""
+    m = R.shape[0]
+    found = cholesky.factor(R)
+    diagonal = jnp.diagonal(found.lower)
+    eye = jnp.eye(m, dtype=R.dtype)
+    unit = jnp.where(eye > 0, 1, matmul(found.lower, eye * found.reciprocal[None]))
+    fine = jnp.all(jnp.isfinite(seen))
+    psd = jnp.all(jnp.isfinite(R)) & jnp.all(jnp.diagonal(R) >= 0)
+    allowed = psd if exact else psd & found.full_rank
+    factor = cholesky.Factor(unit, jnp.ones(m, R.dtype), found.full_rank)
+    return _Noise(factor, jnp.square(diagonal)), fine & allowed
 
 
 def _info(
@@ -175,21 +399,21 @@ def _info(
     difference: Array,
     R: Array,
     measurement: Measurement,
-    weight: Array | float,
+    good: Array,
 ) -> Info:
     mask = measurement.mask
-    cov, known = symmetric.inverse(state.matrix)
+    known = determined(state)
+    leads = equations.leading(state.rows, seen)
+    variances = jnp.where(known, state.variances, 1)
+    spread = matmul(leads * variances[None], leads.T)
     innovation = gaussian.innovate(
-        difference - matvec(seen, symmetric.times(cov, state.vector)),
-        seen,
-        matmul(matmul(seen, symmetric.unpack(cov)), seen.T) + R / weight,
-        mask,
+        difference - matvec(leads, state.targets), leads, spread + R, mask
     )
-    used = known & jnp.any(mask)
+    used = known & jnp.any(mask) & good
     return Info(
         jnp.where(known | ~mask, innovation.value, jnp.nan),
         jnp.where(known, innovation.cov, jnp.nan),
         jnp.where(used, gaussian.log_density(innovation, mask), 0),
         state.time - measurement.time,
-        jnp.zeros((), jnp.int32),
+        jnp.where(good, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),
     )

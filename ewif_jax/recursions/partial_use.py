@@ -49,9 +49,7 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
 def _mixed(old: Any, new: Any, share: Array) -> Any:
     """(1 - share) old + share new, in what makes up the estimate."""
     if isinstance(old, InformationState):
-        shifted = new.vector + information.times(new.matrix, new.mean - old.mean)
-        matrix, vector = _mix((old.matrix, old.vector), (new.matrix, shifted), share)
-        return information.recentred(old._replace(matrix=matrix, vector=vector))
+        return information.blended(old, new, share)
     plain = hasattr(old, "mean") and hasattr(old, "cov")
     checks.require(
         plain, "softness", "an estimator with means and a covariance as state", type(old).__name__

@@ -12,35 +12,34 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.kernels import symmetric
 from ewif_jax.models.linearise import affine_flow
 from ewif_jax.models.model import Model
-from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.information import InformationState, grown, moved
 
 
 class Passage(NamedTuple):
     """What happens to old information: x moves on to ahead x + offset and back by `back`
-    (both (n, n)), and information counts `weight` () as much."""
+    (both (n, n)), and variances count `growth` () as much."""
 
     ahead: Array
     offset: Array
     back: Array
-    weight: Array
+    growth: Array
 
 
 def passage(
     model: Model,
     params: Any,
-    squared: Callable[[Any, Array, Array], Array],
+    growing: Callable[[Any, Array, Array], Array],
     t0: Array,
     t1: Array,
     dtype: Any,
 ) -> Passage:
-    """The passage from t0 to t1; squared(params, t0, t1) is the factor on the information."""
+    """The passage from t0 to t1; growing(params, t0, t1) is the factor on the variances."""
     F, c = affine_flow(model, params, t0, t1, dtype)
     back, _ = affine_flow(model, params, t1, t0, dtype)
     offset = jnp.zeros(F.shape[0], dtype) if c is None else c
-    return Passage(F, offset, back, jnp.asarray(squared(params, t0, t1), dtype))
+    return Passage(F, offset, back, jnp.asarray(growing(params, t0, t1), dtype))
 
 
 def standstill(n: int, dtype: Any) -> Passage:
@@ -55,24 +54,12 @@ def then(first: Passage, second: Passage) -> Passage:
         matmul(second.ahead, first.ahead),
         matvec(second.ahead, first.offset) + second.offset,
         matmul(first.back, second.back),
-        first.weight * second.weight,
+        grown(first.growth, second.growth),
     )
 
 
 def carried(state: InformationState, over: Passage, to: Array) -> InformationState:
     """The state after the passage, at time `to`."""
-    return InformationState(
-        to,
-        matvec(over.ahead, state.mean) + over.offset,
-        over.weight * symmetric.congruence(over.back.T, state.matrix),
-        over.weight * matvec(over.back.T, state.vector),
-    )
-
-
-def joined(a: InformationState, b: InformationState) -> InformationState:
-    """The information of two states of one time together, around a's mean if `a` determines one
-    (else around b's), which keeps the vector short."""
-    _, determined = symmetric.inverse(a.matrix)
-    mean = jnp.where(determined, a.mean, b.mean)
-    shifted = [s.vector + symmetric.times(s.matrix, s.mean - mean) for s in (a, b)]
-    return a._replace(mean=mean, matrix=a.matrix + b.matrix, vector=shifted[0] + shifted[1])
+    mean = matvec(over.ahead, state.mean) + over.offset
+    faded = state._replace(time=to, variances=grown(state.variances, over.growth))
+    return moved(faded, over.ahead, over.back)._replace(mean=mean)

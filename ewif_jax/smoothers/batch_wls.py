@@ -21,6 +21,7 @@ from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible,
 from ewif_jax.models.model import Model
 from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
+from ewif_jax.recursions.information import refuse_exact
 from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
@@ -75,6 +76,7 @@ def batch_wls(
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     checks.require(times is not None, "times", "when to estimate, (K,) seconds", None)
     check_sensors(model, params, None, measurements)
+    refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "batch_wls")
     checks.require(callable(weight), "weight", "a function (params, t_l, t_k)", repr(weight))
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, times, in_order=False)
@@ -120,13 +122,14 @@ def _batch_wls(
         target = model.residual(measurement.value, known, measurement.sensor)
         rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
-        return weight(params, measurement.time, time) * cholesky.forward(noise, rows)
+        white = jnp.where(noise.full_rank, cholesky.forward(noise, rows), jnp.nan)
+        return _weighted(weight(params, measurement.time, time), white)
 
     def believed_from(time: Array, prior: Gaussian) -> Array:
         A, c = affine_flow(model, params, time, t0, dtype)
         target = prior.mean if c is None else prior.mean - c
         spread = cholesky.factor(prior.cov)
-        return weight(params, t0, time) * cholesky.forward(spread, jnp.c_[A, target])
+        return _weighted(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
 
     def at(time: Array) -> Gaussian:
         rows = jax.vmap(partial(seen_from, time))(measurements)
@@ -136,6 +139,11 @@ def _batch_wls(
         return _least_squares(rows[:, :-1], rows[:, -1])
 
     return lax.map(at, times, batch_size=REPORTS_AT_ONCE)
+
+
+def _weighted(weight: Array, rows: Array) -> Array:
+    """What counts nothing is left out, whatever its rows are."""
+    return weight * jnp.where(weight == 0, 0, rows)
 
 
 def _least_squares(rows: Array, target: Array) -> Gaussian:

@@ -1,21 +1,18 @@
-"""Smoothing a fixed lag behind the newest measurement, as estimators for `run` and `step`."""
+"""Smoothing a fixed lag behind the newest measurement, as an estimator for `run` and `step`."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.estimators.ewif import ewif
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.linearise import predict_measurement, predict_state
-from ewif_jax.models.model import Model, resolve
+from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import verdict
-from ewif_jax.recursions.information import InformationState
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -125,37 +122,3 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         return Gaussian(state.mean[-1], state.cov[-n:, -n:])
 
     return Estimator(init, predict, update, estimate, model=model)
-
-
-@from_recipe
-def fixed_lag_ewif(
-    model: Model, tau: Any = None, *, lag: Any, weight: Callable[..., Array] | None = None
-) -> Estimator:
-    r"""The `ewif` that reports `lag` seconds behind its own time.
-
-    .. math::
-        \hat x_{k} = A_{k,m} \hat x_m, \quad P_k = W_{m,k}^{-2} A_{k,m} P_m A_{k,m}'
-        \quad (34), (35), \quad t_k = t_m - \text{lag}
-
-    Shulami & Sigalov, Theorem 5 and section VI-A: there is no process noise, so the smoothed state
-    is the newest one moved back, inputs included. Since W of a newer measurement is above 1, this
-    is not the symmetrically weighted smoother: that is `two_sided_ewif`.
-
-    Args:
-        model, tau, weight: as in `ewif`.
-        lag: seconds >= 0, a number or a function of `params`.
-
-    Reduces to: `ewif` for lag 0; `batch_wls` at the reported time with the weight of `ewif`.
-
-    Raises:
-        ValueError: as `ewif`; lag < 0.
-    """
-    filtered = ewif(model, tau, weight=weight)
-    if not callable(lag):
-        checks.at_least("lag", lag, 0.0)
-
-    def estimate(params: Any, state: InformationState) -> Gaussian:
-        behind = checks.at_least("lag", resolve(lag, params), 0.0)
-        return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
-
-    return Estimator(*filtered[:3], estimate, model=model)

@@ -20,7 +20,6 @@ from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.recursions.passage import joined
 from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
@@ -70,6 +69,8 @@ def two_sided_ewif(
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_sensors(model, params, None, measurements)
     checks.positive("tau", resolve(tau, params))
+    form.refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
+    form.refuse_one_way(model, params, "two_sided_ewif")
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, times, in_order=False)
     stamps = measurements.time
@@ -111,7 +112,7 @@ def _two_sided(
 
     def moved(state: InformationState, time: Array) -> InformationState:
         return form.transport(
-            model, params, state, time, jnp.exp(-jnp.abs(time - state.time) / tau)
+            model, params, state, time, form.exponential(jnp.abs(time - state.time), tau)
         )
 
     def gathered(reverse: bool) -> InformationState:
@@ -135,6 +136,7 @@ def _two_sided(
         sources = [jax.tree.map(lambda x: x[k], side) for side in (past, future)]
         if prior is not None:
             sources.append(form.start(model, params, prior, t0))
-        return form.estimate(reduce(joined, [moved(source, time) for source in sources]))
+        moved_here = [moved(source, time) for source in sources]
+        return form.estimate(form.recentred(reduce(form.joined, moved_here)))
 
     return jax.vmap(at)(times, count)

@@ -29,7 +29,8 @@ from ewif_jax.oosm.pf_retrodict import pf_retrodict
 from ewif_jax.oosm.replay import replay
 from ewif_jax.oosm.rts_reference import rts_reference
 from ewif_jax.oosm.selective import selective
-from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
+from ewif_jax.smoothers.fixed_lag import fixed_lag
+from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 
 PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1, "window": 2.45, "max_delay": 0.77}
 LAG = 4

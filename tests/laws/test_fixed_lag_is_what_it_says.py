@@ -10,7 +10,8 @@ from oracles.joint_gaussian import posterior
 from ewif_jax.estimator import run
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.kalman import kalman
-from ewif_jax.smoothers.fixed_lag import fixed_lag, fixed_lag_ewif
+from ewif_jax.smoothers.fixed_lag import fixed_lag
+from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 from laws.cases import STEPS, case, close, model
 
 LAG = 2

@@ -12,7 +12,7 @@ from ewif_jax.batch import Step, run_batch
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Simulation
-from ewif_jax.smoothers.fixed_lag import fixed_lag_ewif
+from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
 from ewif_jax.study.shared.late import paired, rmse
 from ewif_jax.types import Measurement

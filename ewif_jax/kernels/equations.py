@@ -1,0 +1,359 @@
+"""What is known of a state, as n equations that can be added to one by one.
+
+Equation k says x_k + rows_k . (x_k+1, ..., x_n) = targets_k, with an error of variance variances_k
+that is independent of the others; an infinite variance says nothing yet. An information matrix
+squares the ratio of what is known best to what is known least, and rounding hides the least; here
+the ratio stays as it is, and nothing is inverted to add to it. Gentleman (1973, J. Inst. Maths
+Applics 12, 329) adds an equation in this way; Thornton (1976) moves the variances with weighted
+Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n - 1) / 2 numbers.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ewif_jax.fast.batched import kernel, stage, total
+from ewif_jax.fast.sparse import Pattern, by_row
+
+
+def upper(rows: Array) -> Array:
+    """The equations as a unit upper triangular matrix (n, n)."""
+    return _upper(rows)
+
+
+def strict(full: Array) -> Array:
+    """What lies above the diagonal of a matrix (n, n), row by row."""
+    return _strict(full)
+
+
+def solved(rows: Array, targets: Array) -> Array:
+    """The solution (n,) of the equations."""
+    return _solved(rows, targets)
+
+
+def times(rows: Array, x: Array) -> Array:
+    """What the left-hand sides (n,) are at x (n,)."""
+    return _times(rows, x)
+
+
+def absorbed(
+    variances: Array, rows: Array, equation: Array, noise: Array, vague: bool = True
+) -> tuple[Array, Array, Array, Array]:
+    """Variances and rows with one more `equation` (n,), whose error has variance `noise` ().
+
+    Also leads and steps (n,): what `answered` needs to do the same to the targets, which are the
+    only part that depends on data. A direction about which nothing is known is learnt from an
+    equation only where that is more than the rounding of taking out what is known.
+    """
+    return _absorbed(variances, rows, equation, noise)
+
+
+def answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
+    """The targets with one more equation, which says `residual` ()."""
+    return _answered(targets, residual, leads, steps)
+
+
+def leading(rows: Array, equations: Array) -> Array:
+    """The equations (m, n) in terms of the errors of the rows: equations rows^-1."""
+    return _leading(rows, equations)
+
+
+def inverse(rows: Array) -> Array:
+    """The inverse (n, n) of the unit upper triangular matrix, one too."""
+    return _inverse(rows)
+
+
+def covariance(inverse_rows: Array, variances: Array) -> Array:
+    """The upper triangle of B diag(variances) B', row by row: its variances are sums of squares."""
+    return _covariance(inverse_rows, variances)
+
+
+def spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
+    """Variances and rows of sum_q variances_q vectors_q vectors_q', for vectors (n, q).
+
+    No variance is below the rounding of its component, (8 n eps)^2 of it: what the motion makes as
+    good as certain stays regular.
+    """
+    unit, kept = _spread(vectors, variances)
+    return kept, _strict(_inverse(_strict(unit)))
+
+
+def carried(rows: Array, back: Array, where: Pattern) -> tuple[Array, Array]:
+    """Rows after x <- back x' for an upper triangular matrix `back` that may differ from zero
+    `where`, and the diagonal (n,) of back, by which the targets have to be divided."""
+    return _carried(where)(rows, back)
+
+
+def is_upper(where: Pattern | None) -> bool:
+    """Whether a pattern is known to be upper triangular."""
+    return where is not None and not np.tril(np.asarray(where, bool), -1).any()
+
+
+def _order(rows: Array) -> int:
+    return (1 + int(np.sqrt(8 * rows.shape[0] + 1))) // 2
+
+
+@kernel
+def _upper(rows: Array) -> Array:
+    n = _order(rows)
+    index = np.full((n, n), rows.shape[0])
+    index[np.triu_indices(n, 1)] = np.arange(rows.shape[0])
+    np.fill_diagonal(index, rows.shape[0] + 1)
+    ends = jnp.stack([jnp.zeros(rows.shape[1:], rows.dtype), jnp.ones(rows.shape[1:], rows.dtype)])
+    return jnp.concatenate([rows, ends])[index]
+
+
+@kernel
+def _strict(full: Array) -> Array:
+    n = full.shape[0]
+    i, j = np.triu_indices(n, 1)
+    return full.reshape(n * n, *full.shape[2:])[i * n + j]
+
+
+def _pieces(rows: Array, n: int) -> list[Array]:
+    ends = np.cumsum([0, *range(n - 1, -1, -1)])
+    return [rows[a:b] for a, b in pairwise(ends)]
+
+
+@kernel
+def _solved(rows: Array, targets: Array) -> Array:
+    n, found = targets.shape[0], []
+    for k, row in reversed(list(enumerate(_pieces(rows, n)))):
+        terms = [targets[k], *(-row[j] * x for j, x in enumerate(found))]
+        found.insert(0, total(terms))
+    return jnp.stack(found)
+
+
+@kernel
+def _times(rows: Array, x: Array) -> Array:
+    n = x.shape[0]
+    pieces = enumerate(_pieces(rows, n))
+    return jnp.stack(
+        [total([x[k], *(row[j] * x[k + 1 + j] for j in range(n - 1 - k))]) for k, row in pieces]
+    )
+
+
+@kernel
+def _refined(
+    variances: Array, rows: Array, equation: Array, noise: Array
+) -> tuple[Array, Array, Array, Array]:
+    n, batch = equation.shape[0], equation.ndim - 1
+    found = []
+    for k, row in enumerate(_pieces(rows, n)):
+        lead = equation[0]
+        variance, noise, step = stage(_shared, variances[k], noise, lead, batch=batch)
+        if k < n - 1:
+            row, equation = stage(_turned, row, equation[1:], lead, step, batch=batch)
+        found.append((variance, row, lead, step))
+    return _together(found, rows)
+
+
+def _shared(variance: Array, noise: Array, lead: Array) -> tuple[Array, Array, Array]:
+    """`_met` where nothing is unknown."""
+    told = ~jnp.isinf(noise)
+    kept, both, step = _weighed(variance, jnp.where(told, noise, 0), lead)
+    return (
+        jnp.where(told, kept, variance),
+        jnp.where(told, both, jnp.inf),
+        jnp.where(told, step, 0),
+    )
+
+
+@jax.custom_jvp
+def _weighed(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array]:
+    """v r / S, S = r + lead^2 v and lead v / S; v, S and 0 where S is 0."""
+    S, _, a, b = _shares(v, r, lead)
+    return v * a, S, b
+
+
+@_weighed.defjvp
+def _weighed_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
+    # After a gap v is so large that 1 / S^2 is 0 to the machine: the chain rule then keeps the one
+    # of two terms that should cancel. Here no terms cancel.
+    (v, r, lead), (dv, dr, dlead) = primals, tangents
+    S, q, a, b = _shares(v, r, lead)
+    kept = a * (a * dv) + b * (b * dr) - 2 * (v * a) * (b * dlead)
+    both = dr + lead * (lead * dv) + 2 * (lead * v) * dlead
+    step = lead * (q * (a * dv)) - b * (q * dr) + (v * q) * ((a - lead * b) * dlead)
+    return (v * a, S, b), (kept, both, step)
+
+
+def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array]:
+    """S, 1 / S, r / S and lead v / S."""
+    S = r + lead * (lead * v)
+    some = S > 0
+    q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
+    return S, q, jnp.where(some, r * q, 1), lead * (v * q)
+
+
+def _turned(row: Array, rest: Array, lead: Array, step: Array) -> tuple[Array, Array]:
+    rest = rest - lead[None] * row
+    return row + step[None] * rest, rest
+
+
+@kernel
+def _absorbed(
+    variances: Array, rows: Array, equation: Array, noise: Array
+) -> tuple[Array, Array, Array, Array]:
+    n, batch = equation.shape[0], equation.ndim - 1
+    scale, found = jnp.abs(equation), []
+    for k, row in enumerate(_pieces(rows, n)):
+        variance, noise, lead, step = stage(
+            _met(n), variances[k], noise, equation[0], scale[0], batch=batch
+        )
+        if k < n - 1:
+            row, equation, scale = stage(
+                _taken_out, row, equation[1:], scale[1:], lead, step, batch=batch
+            )
+        found.append((variance, row, lead, step))
+    return _together(found, rows)
+
+
+def _together(
+    found: list[tuple[Array, Array, Array, Array]], rows: Array
+) -> tuple[Array, Array, Array, Array]:
+    variances, leads, steps = (jnp.stack([x[i] for x in found]) for i in (0, 2, 3))
+    runs = jnp.broadcast_shapes(variances.shape[1:], rows.shape[1:])
+    parts = [jnp.broadcast_to(x[1], (len(x[1]), *runs)) for x in found]
+    return variances, jnp.concatenate(parts), leads, steps
+
+
+@cache
+def _met(n: int) -> Callable[..., tuple[Array, ...]]:
+    """What happens to the variance of row k and to the noise of an equation with coefficient `lead`
+    there, and by how much of what is left of the equation the row changes.
+
+    With variance v and noise r: v r / (r + lead^2 v), r + lead^2 v, and lead v / (r + lead^2 v); of
+    a row that says nothing r / lead^2, infinite (the equation is used up), and 1 / lead.
+    """
+
+    def met(variance: Array, noise: Array, lead: Array, scale: Array) -> tuple[Array, ...]:
+        unknown, telling = jnp.isinf(variance), ~jnp.isinf(noise)
+        v, r = jnp.where(unknown, 0, variance), jnp.where(telling, noise, 0)
+        rounding = 8 * n * float(jnp.finfo(lead.dtype).eps) * scale
+        lead = jnp.where(unknown & (jnp.abs(lead) <= rounding), 0, lead)
+        again, both, step = _weighed(v, r, lead)
+        fresh = unknown & telling & (lead != 0)
+        inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
+        first = jnp.where(fresh, r * inverted * inverted, jnp.inf)
+        return (
+            jnp.where(unknown, first, jnp.where(telling, again, v)),
+            jnp.where(fresh | ~telling, jnp.inf, both),
+            lead,
+            jnp.where(unknown, inverted, jnp.where(telling, step, 0)),
+        )
+
+    return met
+
+
+def _taken_out(
+    row: Array, rest: Array, scale: Array, lead: Array, step: Array
+) -> tuple[Array, Array, Array]:
+    known = lead[None] * row
+    rest = rest - known
+    return row + step[None] * rest, rest, jnp.maximum(scale, jnp.abs(known))
+
+
+@kernel
+def _answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
+    left, new = residual, []
+    for k in range(targets.shape[0]):
+        left = left - leads[k] * targets[k]
+        new.append(targets[k] + steps[k] * left)
+    return jnp.stack(new)
+
+
+@kernel
+def _leading(rows: Array, equations: Array) -> Array:
+    n, batch, found = equations.shape[1], equations.ndim - 2, []
+    for k, row in enumerate(_pieces(rows, n)):
+        lead = equations[:, 0]
+        found.append(lead)
+        if k < n - 1:
+            equations = stage(_eliminated, equations[:, 1:], lead, row, batch=batch)
+    runs = jnp.broadcast_shapes(*(x.shape[1:] for x in found))
+    return jnp.stack([jnp.broadcast_to(x, (len(x), *runs)) for x in found], 1)
+
+
+def _eliminated(rest: Array, lead: Array, row: Array) -> Array:
+    return rest - lead[:, None] * row[None]
+
+
+@kernel
+def _inverse(rows: Array) -> Array:
+    n, batch = _order(rows), rows.ndim - 1
+    ones, below = jnp.ones((1, *rows.shape[1:]), rows.dtype), []
+    for k, row in reversed(list(enumerate(_pieces(rows, n)))):
+        tail = [stage(_less, row, *below, batch=batch)] if k < n - 1 else []
+        below.insert(0, jnp.concatenate([jnp.zeros((k, *rows.shape[1:]), rows.dtype), ones, *tail]))
+    return jnp.stack(below)
+
+
+def _less(row: Array, *below: Array) -> Array:
+    first = below[0].shape[0] - len(below)
+    return -total(r[None] * b[first:] for r, b in zip(row, below, strict=True))
+
+
+@kernel
+def _covariance(inverse_rows: Array, variances: Array) -> Array:
+    n = variances.shape[0]
+    scaled = inverse_rows * variances[None]
+    i, j = np.triu_indices(n)
+    return total(scaled[i, k] * inverse_rows[j, k] for k in range(n))
+
+
+@kernel
+def _spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
+    n, batch = vectors.shape[0], variances.ndim - 1
+    least = (8 * n * float(jnp.finfo(vectors.dtype).eps)) ** 2
+    floors = least * jnp.sum(vectors * vectors * variances[None], 1)
+    rest, columns, kept = vectors, [], []
+    for j in reversed(range(n)):
+        rest, column, variance = stage(_projected, rest, variances, floors[j], batch=batch)
+        zeros = jnp.zeros((n - 1 - j, *column.shape[1:]), column.dtype)
+        columns.insert(0, jnp.concatenate([column, zeros]))
+        kept.insert(0, variance)
+    return jnp.stack(columns, 1), jnp.stack(kept)
+
+
+def _projected(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
+    """Takes the last vector out of the others."""
+    last = rest[-1]
+    weighted = last * variances
+    variance = jnp.maximum(jnp.sum(last * weighted, 0), floor)
+    some = variance > 0
+    reciprocal = jnp.where(some, 1 / jnp.where(some, variance, 1), 0)
+    column = jnp.sum(rest[:-1] * weighted[None], 1) * reciprocal[None]
+    one = jnp.ones((1, *column.shape[1:]), column.dtype)
+    return rest[:-1] - column[:, None] * last[None], jnp.concatenate([column, one]), variance
+
+
+@cache
+def _carried(where: Pattern) -> Callable[[Array, Array], tuple[Array, Array]]:
+    @kernel
+    def moved(rows: Array, back: Array) -> tuple[Array, Array]:
+        n = back.shape[0]
+        i, j = np.triu_indices(n, 1)
+        diagonal = jnp.stack([back[k, k] for k in range(n)])
+        if back.ndim == 2:
+            full = (
+                _upper(rows) @ back if n > 8 else jnp.sum(_upper(rows)[:, :, None] * back[None], 1)
+            )
+            return full[i, j] / diagonal[i], diagonal
+        matrix = stage(_as_matrix, rows, batch=rows.ndim - 1)
+        across = tuple(zip(*where, strict=True))
+        terms = by_row(jnp.swapaxes(back, 0, 1), across)
+        summed = total(matrix[i, k[j]] * f[j] for f, k in terms)
+        return summed / diagonal[i], diagonal
+
+    return moved
+
+
+def _as_matrix(rows: Array) -> Array:
+    return _upper(rows)
