@@ -86,7 +86,7 @@ def check_covariances_of(
     if model is None or any(checks.known(x) is None for x in jax.tree.leaves(given)):
         return
     check = model.check or check_covariances(model.process_cov, model.measurement_cov)
-    start, end = (float(np.max(t)) for t in (t0, times))
+    start, end = (float(np.max(np.asarray(t))) for t in (t0, times))
     if model.steps is not None:
         end = start + model.steps.dt
     elif not end > start:
