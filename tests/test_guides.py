@@ -18,9 +18,10 @@ import xarray as xr
 import ewif_jax as ej
 
 ROOT = Path(__file__).parents[1]
-BLOCK = r"\n\n```python\n(.*?)```"
-FILE = re.compile(r"^New file `(.+?)`:" + BLOCK, re.DOTALL | re.MULTILINE)
-LINES = re.compile(r"^In `(.+?)`, after the line `(.+?)`:" + BLOCK, re.DOTALL | re.MULTILINE)
+FILE = re.compile(r"^New file `(.+?)`:\n\n```python\n(.*?)```", re.DOTALL | re.MULTILINE)
+LINES = re.compile(
+    r"^In `(.+?)`, after the line `(.+?)`:\n\n```diff\n(.*?)```", re.DOTALL | re.MULTILINE
+)
 CLAIMED = re.compile(r"(\d+)\s+lines\s+for\s+the\s+\w+\s+below,\s+and\s+(\d+)\s+elsewhere")
 
 
@@ -48,7 +49,8 @@ def follow(text: str, tree: Path) -> Followed:
         assert not (tree / path).exists(), path
         (tree / path).write_text(block)
         new += block.count("\n")
-    for path, anchor, block in LINES.findall(text):
+    for path, anchor, added in LINES.findall(text):
+        block = re.sub(r"^\+", "", added, flags=re.MULTILINE)
         lines = (tree / path).read_text().splitlines(keepends=True)
         assert lines.count(f"{anchor}\n") == 1, f"{path}: {anchor}"
         lines.insert(lines.index(f"{anchor}\n") + 1, block)
