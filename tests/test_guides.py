@@ -133,3 +133,22 @@ def test_the_pages_that_code_names_are_there():
     for source in SOURCES:
         for page in NAMED.findall(source.read_text()):
             assert (ROOT / page).exists(), f"{source.name}: {page}"
+
+
+CHOICE = re.compile(r"^\|[^|]*\| `(.+?)` \|.*\| (\d+) \|$", re.MULTILINE)
+KEPT = CHOICE.findall((ROOT / "docs" / "choosing-a-filter.md").read_text())
+
+
+def test_each_choice_keeps_as_many_numbers_as_the_table_says():
+    sensor = ej.models.position_sensor(0.5, dims=2)
+    space = {
+        **{name: getattr(ej, name) for name in ej.__all__},
+        "ej": ej,
+        "model": ej.models.constant_velocity(dims=2, q=0.1, sensors=sensor),
+        "tau": 2.0,
+        "window": 3.0,
+        "limit": 3.0,
+    }
+    assert len(KEPT) == 24
+    found = {call: ej.storage(eval(call, dict(space)), 4).numbers for call, _ in KEPT}
+    assert found == {call: int(numbers) for call, numbers in KEPT}
