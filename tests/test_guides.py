@@ -152,3 +152,13 @@ def test_each_choice_keeps_as_many_numbers_as_the_table_says():
     assert len(KEPT) == 24
     found = {call: ej.storage(eval(call, dict(space)), 4).numbers for call, _ in KEPT}
     assert found == {call: int(numbers) for call, numbers in KEPT}
+
+
+def test_every_decision_has_its_day_and_every_page_its_place_in_the_index():
+    folder = ROOT / "docs" / "decisions"
+    index = (folder / "README.md").read_text()
+    for page in sorted(folder.glob("*.md")):
+        if page.name != "README.md":
+            entries = re.findall(r"^## .+\n\n(.*)", page.read_text(), re.MULTILINE)
+            assert all(re.match(r"\*\d{4}-\d\d-\d\d\.\* ", entry) for entry in entries), page.name
+            assert re.search(rf"\({page.name}\) \| .+: {len(entries)} entries \|", index), page.name
