@@ -159,11 +159,10 @@ def _carried_in(
         none = seconds[0].time.size == 0  # the prefix sum of two asks for this
         return seconds if none else jax.vmap(together)(firsts, seconds)
 
-    vague = stretches[0].vague  # as everything of which a prefix sum is made
     still = way.standstill(start.mean.shape[0], start.mean.dtype)
-    nothing_before = start._replace(vague=vague), still
+    nothing_before = start, still
     links = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), nothing_before, stretches)
-    return lax.associative_scan(pairwise, links)[0]._replace(vague=start.vague)
+    return lax.associative_scan(pairwise, links)[0]
 
 
 def _padded(x: Array, to: int) -> Array:

@@ -1,6 +1,7 @@
 """The rooms of the package, their one direction of imports, and what importing it does."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,35 +12,19 @@ import ewif_jax
 
 ROOT = Path(ewif_jax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
+MAP = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
 
-RANKS = (
-    {"recipe"},
-    {"types"},
-    {"checks"},
-    {"plain"},
-    {"fast"},
-    {"kernels"},
-    {"models"},
-    {"clocks"},
-    {"streams"},
-    {"arrival"},
-    {"trial"},
-    {"estimator", "every_run"},
-    {"recursions", "batch"},
-    {"estimators"},
-    {"oosm", "smoothers", "analysis", "parallel"},
-    {"scores", "continuous", "charges"},
-    {"charging"},
-    {"losses", "transforms"},
-    {"tuning", "monte_carlo"},
-    {"scenarios"},
-    {"study"},
-    {"__init__", "__main__"},
-)
-STRANGERS = {"estimators", "oosm"}
-"""Rooms whose files do not import each other."""
-SHARED = "oosm.parts"
-"""What they share; it knows none of them."""
+
+def listed(block: str) -> list[str]:
+    """The lines of a block of docs/architecture.md."""
+    (found,) = re.findall(rf"```{block}\n(.*?)\n```", MAP, re.DOTALL)
+    return found.splitlines()
+
+
+RANKS = {room: k for k, rooms in enumerate(listed("order")) for room in rooms.split()}
+"""How far down the order of imports a room is; what is on one line has one rank."""
+STRANGERS = {line.split()[0]: set(line.split()[2:]) for line in listed("strangers")}
+"""Rooms whose files do not import each other, and what of them all may import."""
 
 
 def module(file: Path) -> str:
@@ -50,18 +35,14 @@ def room(name: str) -> str:
     return name.split(".")[0]
 
 
-def rank(name: str) -> int:
-    return next(k for k, rooms in enumerate(RANKS) if room(name) in rooms)
-
-
-def imported(file: Path) -> list[str]:
-    """Modules of ours that a file imports anywhere, inside functions too."""
+def imported(source: str) -> list[str]:
+    """Modules of ours that a source imports anywhere, inside functions too."""
     found = []
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}: relative import"
+            assert node.level == 0, "relative import"
             base = node.module or ""
             for alias in node.names:
                 inner = f"{base}.{alias.name}".removeprefix("ewif_jax.").replace(".", "/")
@@ -71,37 +52,58 @@ def imported(file: Path) -> list[str]:
     return [name.removeprefix("ewif_jax").removeprefix(".") or "__init__" for name in ours]
 
 
-def test_every_file_lives_in_a_known_room():
-    known = set().union(*RANKS)
-    assert {room(module(file)) for file in FILES} <= known
+def refused(here: str, source: str) -> list[str]:
+    """What the module `here` with this source must not import."""
+    names = [name for name in imported(source) if name != here]
+    upward = [n for n in names if room(n) != room(here) and RANKS[room(n)] >= RANKS[room(here)]]
+    if room(here) not in STRANGERS or here == room(here):
+        return upward
+    shared = tuple(STRANGERS[room(here)])
+    siblings = [n for n in names if room(n) == room(here) and not n.startswith(shared)]
+    return upward + siblings
+
+
+def test_every_file_lives_in_a_room_of_the_map():
+    assert {room(module(file)) or "__init__" for file in FILES} == set(RANKS)
+
+
+@pytest.mark.parametrize("name", sorted(set(RANKS) - {"__main__"}))
+def test_the_map_says_what_is_in_a_room(name):
+    home = name if (ROOT / name).is_dir() else f"{name}.py"
+    assert re.search(rf"^\| .*`{home}/?`.* \|", MAP, re.MULTILINE), home
 
 
 @pytest.mark.parametrize("file", FILES, ids=module)
-def test_imports_go_one_way(file):
-    here = module(file)
-    for name in imported(file):
-        if room(name) == room(here):
-            continue
-        assert rank(name) < rank(here), f"{here} imports {name}"
+def test_imports_go_one_way_and_published_methods_are_strangers(file):
+    assert refused(module(file), file.read_text()) == []
 
 
-@pytest.mark.parametrize("file", FILES, ids=module)
-def test_files_of_one_room_are_strangers_where_each_is_a_published_method(file):
-    here = module(file)
-    if room(here) not in STRANGERS:
-        return
-    siblings = [name for name in imported(file) if room(name) == room(here)]
-    siblings = [name for name in siblings if not name.startswith(SHARED)]
-    assert siblings in ([], [room(here)]), f"{here} imports {siblings}"
+PLANTED = {
+    "upward": ("models/sensors.py", "from ewif_jax.recursions import covariance"),
+    "upward, of one line": ("scores.py", "from ewif_jax.continuous.error import anything"),
+    "upward, of the face": ("losses.py", "import ewif_jax"),
+    "upward, inside a function": ("kernels/gaussian.py", "def f():\n    import ewif_jax.oosm.asd"),
+    "a sibling": ("estimators/fading.py", "from ewif_jax.estimators.kalman import kalman"),
+    "a sibling by its room": ("oosm/a1.py", "from ewif_jax.oosm import asd"),
+    "a model, in fast": ("fast/loops.py", "from ewif_jax.models.model import Model"),
+    "a kernel, in fast": ("fast/small.py", "from ewif_jax.kernels import gaussian"),
+    "a filter, in fast": ("fast/memo.py", "from ewif_jax.estimators.kalman import kalman"),
+}
 
 
-def test_the_checker_sees_imports_inside_functions(tmp_path):
-    source = tmp_path / "a.py"
-    source.write_text(
-        "def f():\n    from ewif_jax import tuning\n    import ewif_jax.oosm.asd\n"
-        "from ewif_jax.models.model import Model\n"
+@pytest.mark.parametrize("planted", PLANTED.values(), ids=PLANTED)
+def test_a_planted_import_is_refused(planted):
+    place, line = planted
+    file = ROOT / place
+    source = file.read_text()
+    assert refused(module(file), f"{source}\n{line}\n") == imported(line)
+
+
+def test_what_methods_share_is_not_refused():
+    line = (
+        "from ewif_jax.oosm.parts.history import anything\nfrom ewif_jax.recursions import contract"
     )
-    assert sorted(imported(source)) == ["models.model", "oosm.asd", "tuning"]
+    assert refused("oosm.new", line) == []
 
 
 @pytest.mark.parametrize("name", ewif_jax.__all__)
@@ -167,14 +169,21 @@ def test_no_estimator_is_changed_in_place(file):
 
 
 BUILT = ("Estimator", "Model", "Scenario", "Sensor", "Transform")
+OFFERED = {
+    *ewif_jax.__all__,
+    *ewif_jax.models.__all__,
+    *ewif_jax.scenarios.__all__,
+    *ewif_jax.analysis.__all__,
+    *ewif_jax.continuous.__all__,
+    *(name for name in vars(ewif_jax.transforms) if not name.startswith("_")),
+}
+"""What a user can call; the rest are parts of builders."""
 
 
 @pytest.mark.parametrize("file", FILES, ids=module)
 def test_what_a_public_builder_makes_knows_its_recipe(file):
-    if room(module(file)) in ("recursions", "study") or module(file).startswith(SHARED):
-        return  # parts of builders
     for node in ast.parse(file.read_text()).body:
-        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+        if isinstance(node, ast.FunctionDef) and node.name in OFFERED:
             builds = isinstance(node.returns, ast.Name) and node.returns.id in BUILT
             names = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
             assert not builds or "from_recipe" in names, f"{module(file)}.{node.name}"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.kernels.growth import exponential, reciprocal_square
 from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
@@ -14,6 +15,7 @@ from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -73,9 +75,9 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
         del key
         if tau is not None:
             checks.positive("tau", resolve(tau, params))
-        form.refuse_exact(model, params, t0, "ewif")
-        form.refuse_one_way(model, params, "ewif")
-        return form.start(model, params, prior, t0, None if weight is None else ())
+        refuse_exact(model, params, t0, "ewif")
+        refuse_one_way(model, params, "ewif")
+        return form.start(model, params, prior, t0)
 
     growing = growth(tau, weight)
 
@@ -106,10 +108,10 @@ def growth(tau: Any, weight: Callable[..., Array] | None) -> Callable[[Any, Arra
 
     def by_weight(params: Any, measured: Array, now: Array) -> Array:
         assert weight is not None
-        return form.reciprocal_square(jnp.asarray(weight(params, measured, now), now.dtype))
+        return reciprocal_square(jnp.asarray(weight(params, measured, now), now.dtype))
 
     def by_decay(params: Any, measured: Array, now: Array) -> Array:
         decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), now.dtype)
-        return form.exponential(now - measured, decay)
+        return exponential(now - measured, decay)
 
     return by_decay if weight is None else by_weight

@@ -13,6 +13,7 @@ from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.invertible import refuse_one_way
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -41,7 +42,7 @@ def information(model: Model) -> Estimator:
         del key
         if prior is None:
             need_reversible(model, "information with prior=None")
-            form.refuse_one_way(model, params, "information with prior=None")
+            refuse_one_way(model, params, "information with prior=None")
         return form.start(model, params, prior, t0)
 
     def move(params: Any, state: InformationState, time: Array) -> InformationState:

@@ -15,6 +15,7 @@ from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.invertible import refuse_exact
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement
 
 
@@ -62,8 +63,8 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     def first_state(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> WindowState:
         del key
         checks.positive("window", resolve(window, params))
-        form.refuse_exact(model, params, t0, "limited_memory")
-        start = form.start(model, params, prior, t0, ())
+        refuse_exact(model, params, t0, "limited_memory")
+        start = form.start(model, params, prior, t0)
         # As an argument: a table of NumPy cannot be indexed while tracing.
         m = jax.eval_shape(
             lambda own: jnp.asarray(linear.H(own, jnp.zeros((), jnp.int32), start.time)), params

@@ -41,7 +41,7 @@ def times(rows: Array, x: Array) -> Array:
 
 
 def absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array, vague: bool = True
+    variances: Array, rows: Array, equation: Array, noise: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Variances and rows with one more `equation` (n,), whose error has variance `noise` ().
 

@@ -73,7 +73,6 @@ def _clamps(model: Model, index: int, inputs: tuple) -> bool:
 
     The checks are traced on their own first: they see nothing when traced in eager evaluation.
     """
-
     linear = model.linear
 
     def seen(sensor: Any, params: Any, x: Any, t: Any) -> tuple[Any, Any]:

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
+from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import affine_flow, observation, patterns, size
 from ewif_jax.types import Gaussian, Info, Measurement, Status
@@ -26,16 +26,13 @@ from ewif_jax.types import Gaussian, Info, Measurement, Status
 
 class InformationState(NamedTuple):
     """time (), mean (n,): the reference, variances (n,), rows (n (n - 1) / 2,), targets (n,): the
-    equations, vague: () if something may be unknown yet, None if the prior said of everything
-    something (a difference in structure, so that a program without unknowns has no code for them).
-    """
+    equations."""
 
     time: Array
     mean: Array
     variances: Array
     rows: Array
     targets: Array
-    vague: tuple[()] | None = None
 
     @property
     def matrix(self) -> Array:
@@ -44,22 +41,20 @@ class InformationState(NamedTuple):
         return symmetric.pack(T.T @ (T / self.variances[:, None]))
 
 
-def start(
-    model: Model, params: Any, prior: Gaussian | None, t0: Any, vague: tuple[()] | None = None
-) -> InformationState:
-    """The state that knows the prior, or nothing; `vague` () if the prior may be forgotten."""
+def start(model: Model, params: Any, prior: Gaussian | None, t0: Any) -> InformationState:
+    """The state that knows the prior, or nothing."""
     checks.prior(prior)
     if prior is None:
         t0 = jnp.asarray(t0)
         t0 = t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
         nothing = jnp.zeros(size(model, params, t0), t0.dtype)
-        return InformationState(t0, nothing, *_unknown(nothing), ())
+        return InformationState(t0, nothing, *_unknown(nothing))
     checks.psd("prior.cov", prior.cov, definite=True)
     mean = jnp.asarray(prior.mean)
     lower = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
     variances, rows = equations.spread(lower, jnp.ones_like(mean))
     return InformationState(
-        jnp.asarray(t0, mean.dtype), mean, variances, rows, jnp.zeros_like(mean), vague
+        jnp.asarray(t0, mean.dtype), mean, variances, rows, jnp.zeros_like(mean)
     )
 
 
@@ -89,14 +84,12 @@ def transport(
             rows=rows,
             targets=faded.targets / diagonal,
         )
-    back = None
-    if state.vague is not None:
-        back, _ = affine_flow(model, params, time, state.time, dtype)
+    back, _ = affine_flow(model, params, time, state.time, dtype)
     return moved(faded, F, back, noise)._replace(mean=mean)
 
 
 def moved(
-    state: InformationState, ahead: Array, back: Array | None, noise: Array | None = None
+    state: InformationState, ahead: Array, back: Array, noise: Array | None = None
 ) -> InformationState:
     """The equations of a state whose reference has moved by `ahead` (n, n); `back`, its inverse, is
     needed only while something is unknown.
@@ -115,9 +108,6 @@ def moved(
         kept, rows = equations.spread(jnp.concatenate([vectors, noise], 1), both)
     targets = equations.times(rows, error)
     certain = state._replace(variances=kept, rows=rows, targets=targets)
-    if state.vague is None:
-        return certain
-    assert back is not None
     usable = jnp.all(jnp.isfinite(back))
     back = jnp.where(usable, back, jnp.eye(n, dtype=back.dtype))
     told = matmul(equations.upper(state.rows), back)
@@ -180,7 +170,9 @@ def recentred_on(state: InformationState, mean: Array) -> InformationState:
 def blended(old: InformationState, new: InformationState, share: Array) -> InformationState:
     """(1 - share) times the information of `old` and `share` times that of `new`."""
     parts = (old, 1 - share), (new, share)
-    faded = [s._replace(variances=grown(s.variances, _reciprocal(part))) for s, part in parts]
+    faded = [
+        s._replace(variances=grown(s.variances, bounded_reciprocal(part))) for s, part in parts
+    ]
     return recentred(joined(*faded))
 
 
@@ -204,9 +196,7 @@ def absorb(
     spreads = jnp.where(used & mask, noise.variances * growth, jnp.inf)
     variances, rows, targets = state.variances, state.rows, state.targets
     for k in range(mask.shape[0]):  # apart from the targets it depends on no data: runs share it
-        variances, rows, leads, steps = equations.absorbed(
-            variances, rows, told[k], spreads[k], state.vague is not None
-        )
+        variances, rows, leads, steps = equations.absorbed(variances, rows, told[k], spreads[k])
         targets = equations.answered(targets, apart[k], leads, steps)
     updated = state._replace(variances=variances, rows=rows, targets=targets)
     info = _info(state, usable, residual, R * growth, measurement, good)
@@ -231,8 +221,6 @@ def contribution(
 
 def determined(state: InformationState) -> Array:
     """Whether something is known about every direction."""
-    if state.vague is None:
-        return jnp.ones((), bool)
     return largest(state.variances) < jnp.inf
 
 
@@ -255,88 +243,6 @@ def estimate(state: InformationState) -> Gaussian:
         jnp.where(known, state.mean, jnp.nan),
         symmetric.unpack(jnp.where(known, cov, jnp.nan)),
     )
-
-
-def largest_variance(dtype: Any) -> float:
-    """How large a variance may become. The derivative of an update divides by squares of variances:
-    they and their reciprocals have to be ordinary numbers."""
-    return float(jnp.finfo(dtype).max) ** 0.4
-
-
-def grown(variances: Array, growth: Array | float) -> Array:
-    """Variances times `growth`, but no larger than `largest_variance`.
-
-    So what was known never becomes nothing, its derivatives stay finite, and the prediction after
-    any gap is still one. What is infinite, or grows without bound at once, becomes infinite.
-    """
-    growth = jnp.asarray(growth, variances.dtype)
-    ceiling = largest_variance(variances.dtype)
-    fits = variances <= ceiling / growth
-    larger = jnp.where(fits, variances, 0) * jnp.where(fits, growth, 1)
-    larger = jnp.where(fits, larger, jnp.maximum(lax.stop_gradient(variances), ceiling))
-    return jnp.where(jnp.isfinite(growth) & ~jnp.isinf(variances), larger, growth + variances)
-
-
-def exponential(age: Array, tau: Array) -> Array:
-    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives."""
-    dtype = jnp.result_type(age, tau)
-    most = float(np.log(largest_variance(dtype)))
-    return jnp.exp(jnp.clip(age / tau, -most, most))
-
-
-def reciprocal_square(weight: Array) -> Array:
-    """1 / weight^2, infinite for a weight of zero and saturated for one that is very small."""
-    square = jnp.square(weight)
-    return jnp.where(square == 0, jnp.inf, _reciprocal(square))
-
-
-def refuse_exact(model: Model, params: Any, t0: Any, method: str) -> None:
-    """Refuses a known R that is not positive definite."""
-    for sensor in range(model.sensors or 1):
-        with jax.ensure_compile_time_eval():
-            R = checks.known(model.measurement_cov(params, np.int32(sensor), t0))
-        if R is None or R.ndim != 2 or R.shape[0] != R.shape[1]:
-            continue
-        R = R.astype(float)
-        diagonal = np.diagonal(R)
-        name = "R" if (model.sensors or 1) == 1 else f"R of sensor {sensor}"
-        good = bool(np.all(diagonal > 0) and np.all(np.isfinite(R)))
-        smallest = float(np.min(diagonal, initial=np.inf))
-        if good:
-            scale = np.sqrt(diagonal)
-            smallest = float(np.linalg.eigvalsh(R / scale[:, None] / scale).min(initial=np.inf))
-            good = smallest > 8 * len(R) * np.finfo(np.float32).eps * 1e-6
-        checks.require(
-            good,
-            name,
-            f"a positive definite covariance: {method} adds up R^-1, which an exact measurement "
-            "has not (kalman, information, fading, square_root, al1 and the like take one; or "
-            "give it a small variance)",
-            f"smallest eigenvalue {smallest:.3g}",
-        )
-
-
-def refuse_one_way(model: Model, params: Any, method: str) -> None:
-    """Refuses a known F that has no inverse."""
-    linear = model.linear
-    if linear is None or linear.F_where is None:
-        return
-    with jax.ensure_compile_time_eval():
-        back = checks.known(linear.F(params, jnp.ones(()), jnp.zeros(())))
-    checks.require(
-        back is None or not np.isnan(back).any(),
-        "F",
-        f"a matrix that has an inverse: {method} moves what is known back in time (kalman, fading "
-        "and square_root do not)",
-        "a singular one",
-    )
-
-
-def _reciprocal(x: Array) -> Array:
-    """1 / x, saturated like `grown`."""
-    most = largest_variance(x.dtype)
-    usable = x > 1 / most
-    return jnp.where(usable, 1 / jnp.where(usable, x, 1), jnp.where(jnp.isnan(x), x, most))
 
 
 def _over(variances: Array, diagonal: Array) -> Array:

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.kernels.growth import grown
 from ewif_jax.models.linearise import affine_flow
 from ewif_jax.models.model import Model
-from ewif_jax.recursions.information import InformationState, grown, moved
+from ewif_jax.recursions.information import InformationState, moved
 
 
 class Passage(NamedTuple):

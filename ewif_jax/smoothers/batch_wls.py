@@ -21,7 +21,7 @@ from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible,
 from ewif_jax.models.model import Model
 from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
-from ewif_jax.recursions.information import refuse_exact
+from ewif_jax.recursions.invertible import refuse_exact
 from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 

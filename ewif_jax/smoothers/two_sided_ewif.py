@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.kernels.growth import exponential
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -20,6 +21,7 @@ from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
+from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
 from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.types import Gaussian, Measurement
 
@@ -69,8 +71,8 @@ def two_sided_ewif(
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_sensors(model, params, None, measurements)
     checks.positive("tau", resolve(tau, params))
-    form.refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
-    form.refuse_one_way(model, params, "two_sided_ewif")
+    refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
+    refuse_one_way(model, params, "two_sided_ewif")
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, times, in_order=False)
     stamps = measurements.time
@@ -112,7 +114,7 @@ def _two_sided(
 
     def moved(state: InformationState, time: Array) -> InformationState:
         return form.transport(
-            model, params, state, time, form.exponential(jnp.abs(time - state.time), tau)
+            model, params, state, time, exponential(jnp.abs(time - state.time), tau)
         )
 
     def gathered(reverse: bool) -> InformationState:

@@ -101,6 +101,7 @@ class Experiment:
         return jax.random.fold_in(jax.random.key(self.options.seed), number)
 
     def say(self, text: str) -> None:
+        """Prints a line, as it is."""
         self.console.print(text, markup=False)
 
     @contextmanager

@@ -17,6 +17,7 @@ class Study(NamedTuple):
     help: str
 
     def load(self) -> Callable[["Experiment"], None]:
+        """The function `run` of the study."""
         folder = self.name.replace("-", "_")
         return import_module(f"ewif_jax.study.papers.{folder}.study").run
 

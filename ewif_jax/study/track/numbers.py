@@ -26,7 +26,8 @@ EITHER = re.compile(r"[+-]?\d{1,3},\d{3}")  # 1,234
 
 
 def decimal_mark(table: Table, names: Sequence[str], given: str | None = None) -> str:
-    """ "." or ",": what the cells of the columns leave no doubt about, the same for the file.
+    """The mark of decimals, "." or ",", that the cells of the columns leave no doubt about; one for
+    the file.
 
     Raises:
         Refused: some say one and some the other, or they can be read either way.
