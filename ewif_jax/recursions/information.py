@@ -10,7 +10,6 @@ far from the origin that is more than what one measurement changes.
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -19,6 +18,7 @@ from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import affine_flow, observation, patterns, size
 from ewif_jax.types import Gaussian, Info, Measurement, Status
@@ -132,7 +132,7 @@ def moved(
             rows=both.rows[both.rows.shape[0] - state.rows.shape[0] :],
             targets=both.targets[n:],
         )
-    return choose_known(determined(state), certain, partial)
+    return choose(determined(state), certain, partial)
 
 
 def gathered(
@@ -256,13 +256,6 @@ def _unknown(nothing: Array) -> tuple[Array, Array, Array]:
 
 def _nothing(like: Array) -> dict[str, Array]:
     return dict(zip(("variances", "rows", "targets"), _unknown(jnp.zeros_like(like)), strict=True))
-
-
-def choose_known(
-    known: Array, certain: InformationState, partial: InformationState
-) -> InformationState:
-    """`certain` where everything is known, else `partial`."""
-    return jax.tree.map(lambda a, b: jnp.where(known, a, b), certain, partial)
 
 
 def _sight(
