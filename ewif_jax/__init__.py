@@ -82,7 +82,7 @@ from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 from ewif_jax.smoothers.rts import rts
 from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
-from ewif_jax.streams import stream
+from ewif_jax.streams import arrival_order, newest, stream
 from ewif_jax.transforms import Transform
 from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
@@ -106,6 +106,7 @@ __all__ = [
     "al1",
     "alpha_beta_gains",
     "analysis",
+    "arrival_order",
     "asd",
     "b1",
     "batch_wls",
@@ -141,6 +142,7 @@ __all__ = [
     "monte_carlo",
     "nees",
     "nees_loss",
+    "newest",
     "nis",
     "nis_loss",
     "pcrlb",

@@ -10,7 +10,18 @@ from ewif_jax.clocks import slack
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, in_dtype
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import (
+    DTypeLike,
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    RandomKey,
+    State,
+    Status,
+)
 
 
 class Arrival(NamedTuple):
@@ -29,7 +40,7 @@ class Screened(NamedTuple):
     refused: Any
 
 
-def screen(measurements: Measurement, dtype: Any) -> Screened:
+def screen(measurements: Measurement, dtype: DTypeLike) -> Screened:
     """Takes out what is not a number: a row whose time, or a present component or its square, is
     not finite in `dtype`, is masked as a whole.
 
@@ -55,8 +66,8 @@ def marked(info: Info, refused: Any) -> Info:
 
 def arrive(
     estimator: Estimator,
-    params: Any,
-    state: Any,
+    params: Params,
+    state: State,
     measurement: Measurement,
     clock_time: Array | None = None,
 ) -> Arrival:
@@ -109,12 +120,17 @@ def _place(
 
 
 def initial(
-    estimator: Estimator, params: Any, prior: Gaussian | None, t0: Any, dtype: Any, key: Any
+    estimator: Estimator,
+    params: Params,
+    prior: Gaussian | None,
+    t0: Numbers,
+    dtype: DTypeLike,
+    key: RandomKey,
 ) -> Any:
     """The estimator's first state, with prior (left known where it is known) and t0 in `dtype`."""
     return estimator.init(params, prior_in(prior, dtype), jnp.asarray(t0, dtype), key)
 
 
-def prior_in(prior: Gaussian | None, dtype: Any) -> Gaussian | None:
+def prior_in(prior: Gaussian | None, dtype: DTypeLike) -> Gaussian | None:
     """The prior in `dtype`, its value known as before."""
     return None if prior is None else Gaussian(*(in_dtype(x, dtype) for x in prior))

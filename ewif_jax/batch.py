@@ -27,7 +27,19 @@ from ewif_jax.fast.layout import (
 )
 from ewif_jax.fast.loops import Loop, over_runs
 from ewif_jax.streams import float_dtype, given
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
+from ewif_jax.types import (
+    DTypeLike,
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    PyTree,
+    RandomKey,
+    State,
+    Trace,
+)
 
 
 class Step(NamedTuple):
@@ -45,18 +57,18 @@ Observer = Callable[[Step, Any], Any]
 
 def run_batch(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any = None,
+    t0: Numbers,
+    times: Numbers = None,
     clock: Clock = "validity",
-    key: Any = None,
-    params_per_run: Any = False,
+    key: RandomKey = None,
+    params_per_run: PyTree = False,
     observe: Observer | None = None,
-    context: Any = None,
-    context_per_run: Any = False,
+    context: PyTree = None,
+    context_per_run: PyTree = False,
     devices: int | None = None,
 ) -> Any:
     """The same numbers as `vmap(run)`, many times faster on a CPU.
@@ -110,8 +122,8 @@ def run_batch(
 
 def _filtered(
     estimator: Estimator,
-    inputs: Any,
-    t0: Any,
+    inputs: PyTree,
+    t0: Numbers,
     flags: Frozen,
     clock: Clock,
     observe: Observer | None,
@@ -141,7 +153,9 @@ def _filtered(
     return Trace(time, mean, cov, info, state)
 
 
-def _screened(loop: Loop, estimator: Estimator, inputs: Any, flags: Any, dtype: Any) -> Any:
+def _screened(
+    loop: Loop, estimator: Estimator, inputs: PyTree, flags: PyTree, dtype: DTypeLike
+) -> Any:
     """The same of values that nobody has looked at. A mask for each run costs each run a gain of
     its own, so one condition over the whole batch decides whether it is needed."""
     params, measurements, prior, times, keys, (context, _) = inputs
@@ -166,12 +180,17 @@ _run_batch = quick_jit(_filtered, _STATIC, WIDE)
 
 
 def _loop(
-    estimator: Estimator, t0: Any, clock: Clock, observe: Observer, complete: bool, dtype: Any
+    estimator: Estimator,
+    t0: Numbers,
+    clock: Clock,
+    observe: Observer,
+    complete: bool,
+    dtype: DTypeLike,
 ) -> Loop:
-    def start(params: Any, prior: Any, key: Any) -> Any:
+    def start(params: Params, prior: Any, key: RandomKey) -> Any:
         return initial(estimator, params, prior, t0, dtype, key)
 
-    def step(params: Any, state: Any, arrival: Any) -> tuple[Any, Any]:
+    def step(params: Params, state: State, arrival: Numbers) -> tuple[Any, Any]:
         measurement, time, (seen, refused) = arrival
         if complete and refused is None:
             measurement = measurement._replace(mask=jnp.ones(measurement.mask.shape, bool))
@@ -187,6 +206,6 @@ def _loop(
     return Loop(start, step)
 
 
-def _everything(step: Step, context: Any) -> Step:
+def _everything(step: Step, context: PyTree) -> Step:
     del context
     return step

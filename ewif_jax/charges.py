@@ -16,7 +16,7 @@ from jax import Array
 from jax.core import Tracer
 
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers
 
 Cost = Callable[[Any, Any, Any], Any]
 """(values minus their mean (..., m), spread (..., m), which are present (..., m)) -> (...,)"""
@@ -55,7 +55,7 @@ def value_charges(measurements: Measurement, cost: Cost, unknowns: int) -> Any:
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
-def truth_charges(truth: Any, measurements: Measurement, unknowns: int) -> Any:
+def truth_charges(truth: Numbers, measurements: Measurement, unknowns: int) -> Any:
     """The squared distance (R, T) or (T,) of the truth (..., k) from its mean over runs and rows.
 
     Rows count whose truth is a number, from the row on with which `unknowns` components have been
@@ -76,18 +76,18 @@ def truth_charges(truth: Any, measurements: Measurement, unknowns: int) -> Any:
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
-def squared_cost(error: Any, spread: Any, present: Any) -> Any:
+def squared_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """The squared error about the mean."""
     del spread, present
     return (error**2).sum(-1)
 
 
-def length_cost(error: Any, spread: Any, present: Any) -> Any:
+def length_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """The length of the error about the mean."""
     return squared_cost(error, spread, present) ** 0.5
 
 
-def density_cost(error: Any, spread: Any, present: Any) -> Any:
+def density_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """Minus the log density of independent Gaussians `WIDTH` times as wide as the values spread."""
     xp = _module(error, spread, present)
     wide = WIDTH * spread
@@ -101,13 +101,13 @@ def charged(values: Array, charge: Any) -> Array:
     return jnp.where(jnp.isnan(charge), jnp.nan, jnp.where(jnp.isnan(values), charge, values))
 
 
-def _in_dtype(charge: Any, value: Any) -> Any:
+def _in_dtype(charge: Any, value: Numbers) -> Any:
     """In the dtype of the scores of these values; what it cannot hold is infinite."""
     with np.errstate(over="ignore"):
         return charge.astype(float_dtype(value))
 
 
-def _about_the_mean(value: Any, present: Any, sensor: Any) -> tuple[Any, Any]:
+def _about_the_mean(value: Numbers, present: Numbers, sensor: Numbers) -> tuple[Any, Any]:
     """Values (R, T, m) minus the mean of their sensor's, 0 where absent, and the spread of those.
 
     A sensor that always says the same has no spread; its density is then as wide as the value.
@@ -130,7 +130,7 @@ def _about_the_mean(value: Any, present: Any, sensor: Any) -> tuple[Any, Any]:
     return error.reshape(shape), spread.reshape(shape)
 
 
-def _sums(x: Any, group: Any, groups: int) -> Any:
+def _sums(x: Numbers, group: Any, groups: int) -> Any:
     """Sums (groups, m) of the rows of x (N, m) in each group."""
     if isinstance(x, np.ndarray):
         return np.stack([np.bincount(group, column, groups) for column in x.T], -1)

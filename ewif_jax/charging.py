@@ -17,7 +17,7 @@ from ewif_jax.charges import (
 from ewif_jax.fast.layout import broadcast_prefix, one_run
 from ewif_jax.scores import Score, scored
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params
 
 Unused = Literal["charge", "leave out"]
 
@@ -31,12 +31,12 @@ class Charging(NamedTuple):
     charges: Callable[[int], Any]
     unused: Unused
 
-    def scored(self, params: Any, truth: Any, score: Score) -> Array:
+    def scored(self, params: Params, truth: Numbers, score: Score) -> Array:
         """Scores (R, T); NaN in rows that do not count."""
         values = self.raw(params, truth, score)
         return charged(values, self.charge(params)) if self.unused == "charge" else values
 
-    def raw(self, params: Any, truth: Any, score: Score) -> Array:
+    def raw(self, params: Params, truth: Numbers, score: Score) -> Array:
         """Scores (R, T); NaN where the filter has no answer."""
         checks.require(self.unused in ("charge", "leave out"), "unused",
                        "'charge' or 'leave out'", repr(self.unused))  # fmt: skip
@@ -50,7 +50,7 @@ class Charging(NamedTuple):
         )
         return found["score"]
 
-    def charge(self, params: Any) -> Any:
+    def charge(self, params: Params) -> Any:
         """What the rows cost; NaN in those that do not count."""
         prior = self.setting.get("prior")
         unknowns = 0
@@ -92,13 +92,13 @@ def value_charging(
 
 
 def _state_size(
-    estimator: Estimator, params: Any, measurements: Measurement, setting: dict[str, Any]
+    estimator: Estimator, params: Params, measurements: Measurement, setting: dict[str, Any]
 ) -> int:
     """How many numbers the state has whose estimate the filter reports."""
     dtype = float_dtype(measurements.value)
     own = one_run(params, broadcast_prefix(setting.get("params_per_run", False), params))
 
-    def first(params: Any) -> Gaussian:
+    def first(params: Params) -> Gaussian:
         state = initial(estimator, params, None, setting.get("t0", 0.0), dtype, setting.get("key"))
         return estimator.estimate(params, state)
 

@@ -13,25 +13,25 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, RandomKey
 
 SMALL = 800
 """Bytes of matrices whose eigenvalues are kept: working them out again takes as long as filtering
 a short stream."""
 
 
-def known(x: Any) -> np.ndarray | None:
+def known(x: Numbers) -> np.ndarray | None:
     """`x` as a NumPy array if its value is known now, else None."""
     return None if isinstance(x, Tracer) else np.asarray(x)
 
 
-def with_dtype(x: Any, argument: str = "measurements") -> Any:
+def with_dtype(x: Numbers, argument: str = "measurements") -> Any:
     """`x` if it is an array, else (numbers, lists, columns of tables) as a NumPy array."""
     arrays = Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
     return x if isinstance(x, arrays) else from_rows(argument, x)
 
 
-def from_rows(argument: str, x: Any) -> np.ndarray:
+def from_rows(argument: str, x: Numbers) -> np.ndarray:
     """`x` (numbers, lists, columns of tables) as a NumPy array; refuses rows of unequal lengths."""
     try:
         return np.asarray(x)
@@ -55,7 +55,7 @@ class Shown:
         return repr(self.thing)
 
 
-def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
+def shape(argument: str, x: Numbers, expected: tuple[int | str, ...]) -> None:
     """Refuses an array whose shape differs; a string in `expected` stands for any length."""
     got = np.shape(x)
     same = len(got) == len(expected) and all(
@@ -66,7 +66,7 @@ def shape(argument: str, x: Any, expected: tuple[int | str, ...]) -> None:
         require(False, argument, f"shape {wanted}", f"shape {got}")
 
 
-def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
+def finite(argument: str, x: Numbers, mask: Numbers = True, where: str = "") -> None:
     """Refuses a known array with NaN or infinity in it (where a known mask holds, and `where` says
     so)."""
     if isinstance(x, Tracer):
@@ -80,7 +80,7 @@ def finite(argument: str, x: Any, mask: Any = True, where: str = "") -> None:
         require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
 
 
-def squares_are_finite(x: Any) -> bool:
+def squares_are_finite(x: Numbers) -> bool:
     """Whether all numbers and their squares surely are: one fast pass, of which the sum may also
     overflow for other reasons."""
     value = np.asarray(x)
@@ -88,7 +88,7 @@ def squares_are_finite(x: Any) -> bool:
         return bool(np.isfinite(np.vdot(value, value)))
 
 
-def positive(argument: str, x: Any) -> Any:
+def positive(argument: str, x: Numbers) -> Any:
     """Refuses a value that is not positive; returns it."""
     value = known(x)
     if value is not None:
@@ -97,7 +97,7 @@ def positive(argument: str, x: Any) -> Any:
     return x
 
 
-def at_least(argument: str, x: Any, bound: float) -> Any:
+def at_least(argument: str, x: Numbers, bound: float) -> Any:
     """Refuses a value below `bound`; returns it."""
     value = known(x)
     if value is not None:
@@ -106,14 +106,14 @@ def at_least(argument: str, x: Any, bound: float) -> Any:
     return x
 
 
-def whole(argument: str, x: Any, bound: int) -> int:
+def whole(argument: str, x: Numbers, bound: int) -> int:
     """Refuses anything but a Python integer >= `bound` (a size has to be known before tracing)."""
     ok = isinstance(x, int | np.integer) and not isinstance(x, bool) and x >= bound
     require(ok, argument, f"a whole number >= {bound}", Shown(x))
     return int(x)
 
 
-def psd(argument: str, x: Any, definite: bool = False) -> Any:
+def psd(argument: str, x: Numbers, definite: bool = False) -> Any:
     """Refuses a matrix that is not square, finite, symmetric and positive (semi)definite."""
     value = known(x)
     if value is None:
@@ -174,19 +174,19 @@ def needs_prior(prior: Gaussian | None, method: str) -> Gaussian:
     return prior
 
 
-def needs_key(key: Any, method: str) -> Any:
+def needs_key(key: RandomKey, method: str) -> Any:
     """Refuses a missing PRNG key, and what is none."""
     require(key is not None, "key", f"a PRNG key (jax.random.key(0)): {method} draws noise", None)
     random_key(key)
     return key
 
 
-def is_typed_key(x: Any) -> bool:
+def is_typed_key(x: Numbers) -> bool:
     """Whether these are keys of `jax.random.key`; those of PRNGKey are rows of two numbers."""
     return isinstance(x, Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def random_key(key: Any, runs: int | None = None) -> None:
+def random_key(key: RandomKey, runs: int | None = None) -> None:
     """Refuses what is not a PRNG key, nor (with `runs`) typed keys, one for each run."""
     if key is None:
         return
@@ -215,7 +215,7 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     time, value, sensor, mask = map(with_dtype, measurements)
     lead = ("R", "T") if batched else ("T",)
 
-    def fits(argument: str, x: Any, tail: tuple[int | str, ...]) -> None:
+    def fits(argument: str, x: Numbers, tail: tuple[int | str, ...]) -> None:
         short = batched and np.ndim(x) == 1 + len(tail)
         shape(argument, x, (*(("T",) if short else lead), *tail))
         each = short or not batched or np.shape(x)[0] == runs
@@ -257,7 +257,7 @@ def sensors(measurements: Measurement, count: int | None) -> None:
         sensor("measurements.sensor", int(indices.max()), count)
 
 
-def report_times(times: Any, steps: int) -> None:
+def report_times(times: Numbers, steps: int) -> None:
     """Refuses report times of the wrong length, not finite, or running backwards."""
     shape("times", times, (steps,) if np.ndim(times) < 2 else ("R", steps))
     finite("times", times)

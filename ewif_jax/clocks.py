@@ -9,6 +9,7 @@ from jax import Array
 from ewif_jax import checks, plain
 from ewif_jax.checks import Shown, require
 from ewif_jax.fast.memo import once
+from ewif_jax.types import DTypeLike, Numbers
 
 ALL_TO = 1 / 2
 MOST_TO = 1 / 50
@@ -23,7 +24,7 @@ class Stamps(NamedTuple):
 
 
 def in_seconds(
-    time: Any, t0: Any = None, times: Any = None, name: str = "measurements.time"
+    time: Numbers, t0: Numbers = None, times: Numbers = None, name: str = "measurements.time"
 ) -> tuple[Any, Any, Any]:
     """(time, t0, times) as numbers of seconds.
 
@@ -68,7 +69,7 @@ def _seconds(argument: str, stamps: Stamps, first: Any) -> np.ndarray:
     return since / np.timedelta64(1, "s")
 
 
-def _stamps(argument: str, x: Any) -> Stamps | None:
+def _stamps(argument: str, x: Numbers) -> Stamps | None:
     """`x` if it is date-times or durations."""
     if isinstance(x, Array | float | int):
         return None
@@ -96,7 +97,7 @@ def _from_objects(argument: str, value: np.ndarray) -> Stamps:
     return Stamps(np.array(converted).reshape(value.shape), zones == {True})
 
 
-def _from_object(argument: str, x: Any) -> Any:
+def _from_object(argument: str, x: Numbers) -> Any:
     for method in ("to_datetime64", "to_timedelta64"):  # pandas: in nanoseconds, UTC
         if hasattr(x, method):
             return getattr(x, method)()
@@ -109,7 +110,9 @@ def _from_object(argument: str, x: Any) -> Any:
 
 
 @once
-def representable(dtype: Any, time: Any, t0: Any = None, times: Any = None) -> None:
+def representable(
+    dtype: DTypeLike, time: Numbers, t0: Numbers = None, times: Numbers = None
+) -> None:
     """Refuses known times that `dtype` cannot hold.
 
     All intervals between times that follow each other (stamps of a run, t0 and report times
@@ -177,7 +180,7 @@ def _judge(
 
 
 @once
-def not_ahead(dtype: Any, time: Any, mask: Any, times: Any, t0: Any) -> None:
+def not_ahead(dtype: DTypeLike, time: Numbers, mask: Numbers, times: Numbers, t0: Numbers) -> None:
     """Refuses a known stamp ahead of the filter's clock (`clock="arrival"`), more than rounding."""
     stamp, present, clock, start = map(checks.known, (time, mask, times, t0))
     if stamp is None or clock is None or present is None:

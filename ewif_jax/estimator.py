@@ -12,13 +12,23 @@ from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
 from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Trace
+from ewif_jax.types import (
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    RandomKey,
+    State,
+    Trace,
+)
 
 Clock = Literal["validity", "arrival"]
 
 
 def step(
-    estimator: Estimator, params: Any, state: Any, measurement: Measurement
+    estimator: Estimator, params: Params, state: State, measurement: Measurement
 ) -> tuple[Any, Info]:
     """The state after one arrival, and its diagnostics: the body of `run` as a streaming call.
 
@@ -43,14 +53,14 @@ def step(
 
 def run(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any = None,
+    t0: Numbers,
+    times: Numbers = None,
     clock: Clock = "validity",
-    key: Any = None,
+    key: RandomKey = None,
 ) -> Trace:
     """Estimates after each arrival of a stream.
 
@@ -84,20 +94,20 @@ def run(
 
 def _filtered(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any,
+    t0: Numbers,
+    times: Numbers,
     clock: Clock,
-    key: Any,
+    key: RandomKey,
 ) -> Trace:
     dtype = float_dtype(measurements.value)
     state = initial(estimator, params, prior, t0, dtype, key)
     times = None if times is None else jnp.asarray(times, dtype)
     screened, refused = screen(measurements, dtype)
 
-    def body(state: Any, arrival: tuple[Measurement, Array | None]) -> tuple[Any, tuple]:
+    def body(state: State, arrival: tuple[Measurement, Array | None]) -> tuple[Any, tuple]:
         measurement, time = arrival
         moved = arrive(estimator, params, state, measurement, time if clock == "arrival" else None)
         shown = moved.reported
@@ -110,7 +120,7 @@ def _filtered(
     return Trace(time, mean, cov, marked(info, refused), state)
 
 
-def _compiled(arrivals: int, state: Any, key: Any) -> Any:
+def _compiled(arrivals: int, state: State, key: RandomKey) -> Any:
     """`_filtered`, compiled as hard as so many arrivals and such a state deserve."""
     longest = max((x.shape[-1] for x in jax.tree.leaves(state) if x.ndim), default=1)
     if arrivals * max(longest, 100) <= 1e5:

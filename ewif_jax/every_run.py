@@ -16,7 +16,7 @@ from ewif_jax.fast.memo import once
 from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype
 from ewif_jax.trial import validated
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params, PyTree, RandomKey
 
 
 class Content(NamedTuple):
@@ -31,14 +31,14 @@ class Content(NamedTuple):
 @once
 def examined(
     estimator: Estimator,
-    params: Any,
-    params_per_run: Any,
+    params: Params,
+    params_per_run: PyTree,
     measurements: Measurement,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any,
+    t0: Numbers,
+    times: Numbers,
     clock: Any,
-    key: Any,
+    key: RandomKey,
 ) -> tuple[Any, Content, Screened | None]:
     """Which inputs differ by run, what is known of the values, and the measurements without what
     is not a number if there is such; everything that can be refused now is."""
@@ -81,7 +81,11 @@ def _sifted(measurements: Measurement) -> Screened | None:
 
 
 def flagged(
-    params: Any, params_per_run: Any, measurements: Measurement, prior: Gaussian | None, times: Any
+    params: Params,
+    params_per_run: PyTree,
+    measurements: Measurement,
+    prior: Gaussian | None,
+    times: Numbers,
 ) -> tuple[Any, Any]:
     """(params, measurements, prior, times), and the same with a bool for each leaf: whether it has
     a leading axis of runs."""
@@ -94,7 +98,7 @@ def flagged(
     return (params, measurements, prior, times), flags
 
 
-def per_run_flags(argument: str, prefix: Any, tree: Any) -> Any:
+def per_run_flags(argument: str, prefix: Any, tree: PyTree) -> Any:
     """A bool for each leaf of `tree` from a prefix of it.
 
     Raises:
@@ -109,7 +113,9 @@ def per_run_flags(argument: str, prefix: Any, tree: Any) -> Any:
         ) from error
 
 
-def same_runs(argument: str, tree: Any, flags: Any, runs: int, steps: int | None = None) -> None:
+def same_runs(
+    argument: str, tree: PyTree, flags: PyTree, runs: int, steps: int | None = None
+) -> None:
     """Refuses a leaf marked as one of each run that has not as many, and with `steps` one that has
     another number of arrivals."""
     marks = jax.tree.leaves(flags)
@@ -122,7 +128,7 @@ def same_runs(argument: str, tree: Any, flags: Any, runs: int, steps: int | None
 
 
 def check_runs(
-    estimator: Estimator, inputs: Any, flags: Any, t0: Any, clock: Any, key: Any
+    estimator: Estimator, inputs: PyTree, flags: PyTree, t0: Numbers, clock: Any, key: RandomKey
 ) -> None:
     """Refuses what `run` refuses: with the first run for all, the largest sensor of any run, and
     the priors and parameters also of the runs in which they are lowest."""
@@ -151,7 +157,7 @@ def check_runs(
             raise
 
 
-def _name_forgotten(error: Exception, params: Any, flags: Any, runs: int, trial: Any) -> None:
+def _name_forgotten(error: Exception, params: Params, flags: PyTree, runs: int, trial: Any) -> None:
     """Raises in place of `error`, with the names of parameters that have a leading axis of runs and
     were not marked, if all is well with the first run of them."""
     pairs = zip(tree_leaves_with_path(params), jax.tree.leaves(flags), strict=True)
@@ -174,7 +180,7 @@ def _name_forgotten(error: Exception, params: Any, flags: Any, runs: int, trial:
     ) from error
 
 
-def lowest(params: Any, flags: Any) -> set[int]:
+def lowest(params: Params, flags: PyTree) -> set[int]:
     """The runs in which a number, or the eigenvalue of a matrix, that each run has of its own is
     lowest or not finite."""
     runs = set()
@@ -212,7 +218,7 @@ def _check_prior_axes(prior: Gaussian | None, runs: int) -> None:
     require(np.shape(prior.cov)[-2:] == (n, n), "prior.cov", f"matrices ({n}, {n})", got)
 
 
-def _worst_prior(prior: Gaussian | None, flags: Any) -> Gaussian | None:
+def _worst_prior(prior: Gaussian | None, flags: PyTree) -> Gaussian | None:
     """The prior of the run whose covariance is nearest to none (of the first, where all are
     positive definite)."""
     if prior is None:

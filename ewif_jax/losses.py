@@ -30,7 +30,7 @@ from ewif_jax.charges import (
 )
 from ewif_jax.charging import Charging, Unused, charging_of, value_charging
 from ewif_jax.scores import Score, average
-from ewif_jax.types import Estimator, Measurement
+from ewif_jax.types import Estimator, Measurement, Numbers, Params
 
 Loss = Callable[..., Array]
 
@@ -38,7 +38,7 @@ Loss = Callable[..., Array]
 def rmse_loss(
     estimator: Estimator,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     *,
     unused: Unused = "charge",
     **setting: Any,
@@ -97,7 +97,7 @@ def likelihood_loss(
 
 def log_likelihood(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
     unused: Unused = "charge",
@@ -154,7 +154,7 @@ def prediction_loss(
 def nees_loss(
     estimator: Estimator,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     *,
     unused: Unused = "charge",
     **setting: Any,
@@ -197,16 +197,16 @@ def nis_loss(
 
 
 def _averaged(
-    charging: Charging, truth: Any, score: Score, finish: Callable[[Array], Array]
+    charging: Charging, truth: Numbers, score: Score, finish: Callable[[Array], Array]
 ) -> Loss:
-    def loss(params: Any) -> Array:
+    def loss(params: Params) -> Array:
         return _or_infinite(finish(_mean(charging.scored(params, truth, score))))
 
     return loss
 
 
-def _consistency(charging: Charging, truth: Any, score: Score) -> Loss:
-    def loss(params: Any) -> Array:
+def _consistency(charging: Charging, truth: Numbers, score: Score) -> Loss:
+    def loss(params: Params) -> Array:
         values = charging.raw(params, truth, score)
         if charging.unused == "leave out":
             return _or_infinite(_squared_log(average(values)))

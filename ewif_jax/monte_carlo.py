@@ -15,7 +15,7 @@ from ewif_jax.fast.dependence import dependence, traced
 from ewif_jax.fast.layout import Frozen, broadcast_prefix
 from ewif_jax.recipe import FromRecipe
 from ewif_jax.scores import Score, average, scored, squared_error
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Params, PyTree, RandomKey
 
 
 class Simulation(NamedTuple):
@@ -74,14 +74,14 @@ class Statistics(NamedTuple):
 
 def monte_carlo(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     scenario: Scenario,
     *,
     runs: int,
-    key: Any,
+    key: RandomKey,
     metrics: Mapping[str, Score] | None = None,
     chunk: int | None = None,
-    params_per_run: Any = False,
+    params_per_run: PyTree = False,
     devices: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Statistics:
@@ -189,12 +189,12 @@ def _standard_error(found: _Moments) -> np.ndarray:
     return np.where(count > 1, np.sqrt(found.squares / safe), np.nan)
 
 
-def _one_for_each(key: Any) -> bool:
+def _one_for_each(key: RandomKey) -> bool:
     """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
     return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
 
 
-def _require_key(key: Any, runs: int) -> None:
+def _require_key(key: RandomKey, runs: int) -> None:
     """Refuses what is no key: an int would be taken for one in some calls and not in others."""
     checks.needs_key(key, "monte_carlo")
     dtype = getattr(key, "dtype", None)

@@ -19,7 +19,7 @@ from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.passage import Passage
 from ewif_jax.streams import cast, float_dtype, given
 from ewif_jax.trial import validated
-from ewif_jax.types import Gaussian, Measurement, Trace
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params, Trace
 
 Method = Literal["blocked", "associative"]
 Stretch = tuple[InformationState, Passage]
@@ -27,14 +27,14 @@ Stretch = tuple[InformationState, Passage]
 
 def run_parallel(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
-    tau: Any = None,
+    tau: Parameter = None,
     weight: Callable[..., Array] | None = None,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any = None,
+    t0: Numbers,
+    times: Numbers = None,
     method: Method = "blocked",
     block: int | None = None,
 ) -> Trace:
@@ -88,12 +88,12 @@ def _run_parallel(
     weight: Callable[..., Array] | None,
     method: Method,
     block: int,
-    params: Any,
+    params: Params,
     constant: Any,
     measurements: Measurement,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any,
+    t0: Numbers,
+    times: Numbers,
 ) -> Trace:
     tau = constant if by_params is None else by_params
     estimator = ewif(model, tau, weight=weight)

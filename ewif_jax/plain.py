@@ -11,16 +11,17 @@ from jax.tree_util import keystr, tree_map_with_path
 
 from ewif_jax import checks
 from ewif_jax.checks import Shown, require
+from ewif_jax.types import DTypeLike, Numbers, Params
 
 
-def native(x: Any) -> Any:
+def native(x: Numbers) -> Any:
     """`x` in the byte order of this machine: JAX reads the bytes of any other array as they lie."""
     if isinstance(x, np.ndarray | np.generic) and not x.dtype.isnative:
         return x.astype(x.dtype.newbyteorder("="))
     return x
 
 
-def numbers(argument: str, x: Any, missing: bool = False) -> Any:
+def numbers(argument: str, x: Numbers, missing: bool = False) -> Any:
     """`x` as an array of real numbers: an array of JAX as it is, all else as NumPy's, whole numbers
     as float64 (JAX would cut them to 32 bits).
 
@@ -47,7 +48,7 @@ def numbers(argument: str, x: Any, missing: bool = False) -> Any:
     return value.astype(float) if longer else native(value)
 
 
-def indices(argument: str, x: Any) -> Any:
+def indices(argument: str, x: Numbers) -> Any:
     """`x` as int32 indices, NumPy's unless it is an array of JAX.
 
     Raises:
@@ -67,7 +68,7 @@ def indices(argument: str, x: Any) -> Any:
     return x.astype(np.int32) if isinstance(x, Array) else value.astype(np.int32)
 
 
-def booleans(argument: str, x: Any) -> Any:
+def booleans(argument: str, x: Numbers) -> Any:
     """`x` as booleans, NumPy's unless it is an array of JAX; whole numbers 0 and 1 will do.
 
     Raises:
@@ -88,7 +89,7 @@ def booleans(argument: str, x: Any) -> Any:
     return value.astype(bool)
 
 
-def parameters(params: Any) -> Any:
+def parameters(params: Params) -> Any:
     """`params` with every array that is not one of JAX as NumPy has it, in native byte order.
 
     Raises:
@@ -97,7 +98,7 @@ def parameters(params: Any) -> Any:
     return tree_map_with_path(_parameter, params)
 
 
-def _parameter(path: Any, x: Any) -> Any:
+def _parameter(path: Any, x: Numbers) -> Any:
     if isinstance(x, Array | float | int):
         return x
     require_unmasked(f"params{keystr(path)}", x)
@@ -112,7 +113,7 @@ def _parameter(path: Any, x: Any) -> Any:
     return native(value)
 
 
-def require_unmasked(argument: str, x: Any) -> None:
+def require_unmasked(argument: str, x: Numbers) -> None:
     """Refuses a masked array with something masked in it."""
     hidden = isinstance(x, np.ma.MaskedArray) and np.ma.is_masked(x)
     require(
@@ -123,7 +124,7 @@ def require_unmasked(argument: str, x: Any) -> None:
     )
 
 
-def _real(dtype: Any) -> bool:
+def _real(dtype: DTypeLike) -> bool:
     return jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
 
 

@@ -21,7 +21,7 @@ from ewif_jax.analysis import consistency
 from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.fast.compiling import array
 from ewif_jax.streams import checked_stream, float_dtype, present_values
-from ewif_jax.types import Estimator, Measurement, Status
+from ewif_jax.types import Estimator, Measurement, Numbers, Params, Status
 
 Score = Callable[[Step, Array, Array], Array]
 
@@ -74,9 +74,9 @@ def robust_innovation(step: Step, truth: Array, mask: Array) -> Array:
 
 def scored(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    truth: Any = None,
+    truth: Numbers = None,
     *,
     scores: Mapping[str, Score],
     **setting: Any,

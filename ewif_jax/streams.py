@@ -9,14 +9,19 @@ from jax import Array
 from ewif_jax import checks, clocks, plain
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.memo import once
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import DTypeLike, Gaussian, Measurement, Numbers, Params
 
 checked_stream = once(checks.stream)
 """`checks.stream`, which passes over all numbers, once for the same arrays of JAX."""
 
 
 def stream(
-    time: Any, value: Any, sensor: Any = 0, mask: Any = None, *, arrival: Any = None
+    time: Numbers,
+    value: Numbers,
+    sensor: Numbers = 0,
+    mask: Numbers = None,
+    *,
+    arrival: Numbers = None,
 ) -> Measurement:
     """A stream of measurements from plain arrays.
 
@@ -76,7 +81,7 @@ def stream(
     return Measurement(*(x[order] for x in rows))
 
 
-def arrival_order(arrival: Any) -> Any:
+def arrival_order(arrival: Numbers) -> Any:
     """(T,) indices that put what arrives at `arrival` (T,) in order of arrival; what arrives
     together stays in the order given. Numbers or date-times.
 
@@ -91,7 +96,7 @@ def arrival_order(arrival: Any) -> Any:
     return np.argsort(seconds, kind="stable")
 
 
-def newest(times: Any, truth: Any) -> Any:
+def newest(times: Numbers, truth: Numbers) -> Any:
     """(T, ...) for each arrival the row of `truth` that belongs to the newest time so far.
 
     Args:
@@ -117,7 +122,7 @@ def newest(times: Any, truth: Any) -> Any:
     return truth[_running(np, latest)]
 
 
-def _running(xp: Any, x: Any) -> Any:
+def _running(xp: Any, x: Numbers) -> Any:
     """The running maximum."""
     return xp.maximum.accumulate(x)
 
@@ -133,11 +138,11 @@ class Given(NamedTuple):
 
 
 def given(
-    params: Any,
+    params: Params,
     measurements: Measurement,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any,
+    t0: Numbers,
+    times: Numbers,
     batched: bool = False,
 ) -> Given:
     """What an entry was given, as plain arrays; the one converter of every entry.
@@ -171,7 +176,7 @@ def given(
     return Given(plain.parameters(params), measurements, prior, t0, times)
 
 
-def present_values(value: Any, mask: Any) -> Any:
+def present_values(value: Numbers, mask: Numbers) -> Any:
     """The values as plain numbers, where nothing that a masked array hides is said to be there.
 
     Raises:
@@ -188,7 +193,7 @@ def present_values(value: Any, mask: Any) -> Any:
     return plain.numbers("measurements.value", value)
 
 
-def float_dtype(x: Any) -> Any:
+def float_dtype(x: Numbers) -> Any:
     """The float dtype that a filter of `x` runs in: that of `x` or the default, but nothing
     narrower than float32."""
     dtype = jnp.result_type(plain.native(checks.with_dtype(x)))
@@ -197,7 +202,7 @@ def float_dtype(x: Any) -> Any:
     return dtype if dtype.itemsize >= 4 else np.dtype(np.float32)
 
 
-def cast(measurement: Measurement, dtype: Any) -> Measurement:
+def cast(measurement: Measurement, dtype: DTypeLike) -> Measurement:
     """The measurement with floats in `dtype`, int32 sensors (left known where they are known), and
     zeros where nothing was seen."""
     mask = jnp.asarray(measurement.mask, bool)
@@ -209,7 +214,7 @@ def cast(measurement: Measurement, dtype: Any) -> Measurement:
     )
 
 
-def in_dtype(x: Any, dtype: Any) -> Any:
+def in_dtype(x: Numbers, dtype: DTypeLike) -> Any:
     """`x` in `dtype`, its value known as before."""
     value = checks.known(x)
     return jnp.asarray(x, dtype) if value is None else value.astype(dtype)

@@ -18,18 +18,18 @@ from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.wide_prior import check_prior_width, first_rows
 from ewif_jax.recipe import digest
 from ewif_jax.streams import cast, float_dtype
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params, RandomKey
 
 
 def validated(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any,
+    t0: Numbers,
+    times: Numbers,
     clock: str,
-    key: Any,
+    key: RandomKey,
 ) -> Any:
     """The shapes of the estimator's state, after everything that can be known now of what
     `streams.given` returned has been checked."""
@@ -100,7 +100,7 @@ def _require_same_shapes(before: Any, after: Any) -> None:
     checks.require(same, "params", expected, Shown(new))
 
 
-def _name_parameters(params: Any, error: TypeError) -> None:
+def _name_parameters(params: Params, error: TypeError) -> None:
     """Raises in place of `error` of shapes, if some parameter is an array."""
     shapes = {keystr(path): np.shape(x) for path, x in tree_leaves_with_path(params)}
     arrays = [f"{name} {shape}" for name, shape in shapes.items() if shape]
@@ -121,7 +121,7 @@ def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable 
     return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in known)
 
 
-def _indexable(x: Any) -> Any:
+def _indexable(x: Numbers) -> Any:
     """`x`, its value known as before; but a NumPy table cannot be indexed while tracing."""
     with jax.ensure_compile_time_eval():
         return array(x) if isinstance(x, np.ndarray) else x

@@ -8,6 +8,21 @@ from jax import Array
 
 from ewif_jax.recipe import FromRecipe
 
+Params = Any
+"""What parameters are read from: any pytree; gradients are taken with respect to it."""
+State = Any
+"""A filter's state: a pytree with a field `time`, of a kind that only the filter knows."""
+PyTree = Any
+"""Any pytree."""
+Parameter = Any
+"""A parameter of a builder: a number, an array, or a function of `params` (and of times)."""
+Numbers = Any
+"""What becomes an array: of NumPy or JAX, a number, a list; traced or not."""
+RandomKey = Any
+"""A PRNG key of JAX, or None where nothing is drawn."""
+DTypeLike = Any
+"""A dtype, or what names one."""
+
 
 class Measurement(NamedTuple):
     """One arrival. Stacked on axis 0 it is a stream, in the order of arrival.
@@ -80,7 +95,7 @@ class Init(Protocol):
     """
 
     def __call__(
-        self, params: Any, prior: Gaussian | None, t0: Array, /, key: Any = None
+        self, params: Params, prior: Gaussian | None, t0: Array, /, key: RandomKey = None
     ) -> Any: ...
 
 
@@ -88,21 +103,21 @@ class Predict(Protocol):
     """The state moved to `time` (), with what the filter knows. Earlier than the state: NaN in what
     `estimate` reports of it, unless the method can go back."""
 
-    def __call__(self, params: Any, state: Any, time: Array, /) -> Any: ...
+    def __call__(self, params: Params, state: State, time: Array, /) -> Any: ...
 
 
 class Update(Protocol):
     """The state after a measurement at its time or an earlier one, and diagnostics."""
 
     def __call__(
-        self, params: Any, state: Any, measurement: Measurement, /
+        self, params: Params, state: State, measurement: Measurement, /
     ) -> tuple[Any, Info]: ...
 
 
 class Estimate(Protocol):
     """The mean (n,) and covariance (n, n) that a state stands for."""
 
-    def __call__(self, params: Any, state: Any, /) -> Gaussian: ...
+    def __call__(self, params: Params, state: State, /) -> Gaussian: ...
 
 
 class _Estimator(NamedTuple):

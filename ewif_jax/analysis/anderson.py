@@ -13,6 +13,7 @@ from ewif_jax.analysis.riccati import gain
 from ewif_jax.analysis.stabilising import discrete_lyapunov, stabilising_dare
 from ewif_jax.analysis.stability import require_steady_state
 from ewif_jax.streams import float_dtype
+from ewif_jax.types import Numbers
 
 
 class System(NamedTuple):
@@ -263,7 +264,7 @@ def check_system(
                 checks.psd(f"{label}[{k}]" if stacked else label, one)
 
 
-def _floats(x: Any) -> Array:
+def _floats(x: Numbers) -> Array:
     x = jnp.asarray(x)
     return x.astype(float_dtype(x))
 

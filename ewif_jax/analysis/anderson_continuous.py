@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.stabilising import continuous_lyapunov, stabilising_care
 from ewif_jax.analysis.stability import require_steady_state
 from ewif_jax.streams import float_dtype
+from ewif_jax.types import Params
 
 
 class ContinuousSystem(NamedTuple):
@@ -116,7 +117,7 @@ def check_continuous(
     n: Any = None,
     m: Any = "m",
     *,
-    params: Any = None,
+    params: Params = None,
     start: Any = None,
 ) -> None:
     """Refuses matrices of a system of n states and m measurements that do not fit each other, are

@@ -13,16 +13,16 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.models import Model
 from ewif_jax.streams import cast, checked_stream, float_dtype
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers, Params, State
 
 
 def crlb(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
-    state: Any,
-    time: Any,
+    state: State,
+    time: Numbers,
     weight: Callable[..., Array] | None = None,
     information: Any = None,
 ) -> Array:
@@ -72,7 +72,7 @@ def crlb(
     return _crlb(model, weight, params, stream, state, time, information)
 
 
-def check_finite_information(model: Model, params: Any, measurements: Measurement) -> None:
+def check_finite_information(model: Model, params: Params, measurements: Measurement) -> None:
     """Refuses a known R that is singular in components that are there: of each sensor and mask, at
     its first measurement."""
     given = (params, measurements.time, measurements.sensor, measurements.mask)
@@ -106,7 +106,7 @@ def _full_rank(R: np.ndarray) -> bool:
 def _crlb(
     model: Model,
     weight: Callable[..., Array] | None,
-    params: Any,
+    params: Params,
     stream: Measurement,
     state: Array,
     time: Array,

@@ -14,7 +14,7 @@ from ewif_jax.estimator import run
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.information import information
 from ewif_jax.models.model import Model
-from ewif_jax.types import Estimator, Measurement
+from ewif_jax.types import Estimator, Measurement, Params
 
 
 class Case(NamedTuple):
@@ -27,7 +27,7 @@ class Case(NamedTuple):
     t0: Any
 
 
-def settled_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: int) -> Array:
+def settled_gain(estimator: Estimator, params: Params, m: int, dt: float, steps: int) -> Array:
     """The filter's gain (n, m) after `steps` equally spaced measurements of m components, started
     from nothing: the derivative of the estimate by the last measurement."""
     dtype = jnp.asarray(0.0).dtype
@@ -43,7 +43,7 @@ def settled_gain(estimator: Estimator, params: Any, m: int, dt: float, steps: in
 
 def equivalent_tau(
     model: Model,
-    params: Any = None,
+    params: Params = None,
     *,
     dt: float,
     case: Case | None = None,
@@ -154,7 +154,7 @@ def _relative_difference(gain: Array, target: Array) -> Array:
     return jnp.sum(jnp.square((gain - target) / scale))
 
 
-def _mean_mse(estimator: Estimator, params: Any, case: Case) -> Array:
+def _mean_mse(estimator: Estimator, params: Params, case: Case) -> Array:
     mse = expected_mse(
         estimator,
         params,

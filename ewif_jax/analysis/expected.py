@@ -9,19 +9,19 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.estimator import run
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params
 
 
 def expected_mse(
     estimator: Estimator,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     truth: Array,
     *,
     noise_cov: Any,
     prior: Gaussian | None,
-    t0: Any,
-    times: Any = None,
+    t0: Numbers,
+    times: Numbers = None,
 ) -> Array:
     r"""Mean square error at every arrival: bias squared plus variance, exactly.
 

@@ -15,7 +15,7 @@ from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, predict_measurement, predict_state
 from ewif_jax.streams import cast, checked_stream, float_dtype
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers, Parameter, Params
 
 Bound = tuple[Array, Array, Array]
 """What the recursions carry: the bound (n, n), the true states (R, n) and the time () it is for."""
@@ -23,13 +23,13 @@ Bound = tuple[Array, Array, Array]
 
 def pcrlb(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     *,
     start: Any,
-    prior_cov: Any,
-    t0: Any,
+    prior_cov: Parameter,
+    t0: Numbers,
 ) -> Array:
     r"""The bound (T, n, n) on the error covariance after each measurement, in order of time.
 
@@ -80,14 +80,14 @@ def pcrlb(
 
 def pcrlb_late(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     *,
     start: Any,
-    prior_cov: Any,
-    t0: Any,
-    times: Any,
+    prior_cov: Parameter,
+    t0: Numbers,
+    times: Numbers,
 ) -> Array:
     r"""The bound (T, n, n) at each report, from the measurements that have arrived by then.
 
@@ -132,14 +132,14 @@ def pcrlb_late(
 
 def pcrlb_equivalent(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     *,
     start: Any,
-    prior_cov: Any,
-    t0: Any,
-    times: Any,
+    prior_cov: Parameter,
+    t0: Numbers,
+    times: Numbers,
 ) -> Array:
     r"""The published bound (T, n, n) for late measurements, which is not a bound: it is too high.
 
@@ -184,7 +184,9 @@ def pcrlb_equivalent(
 
 
 @partial(jax.jit, static_argnames="model")
-def _in_order(model: Model, params: Any, stream: Measurement, truth: Array, first: Bound) -> Array:
+def _in_order(
+    model: Model, params: Params, stream: Measurement, truth: Array, first: Bound
+) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
         measurement, states = now
@@ -197,7 +199,7 @@ def _in_order(model: Model, params: Any, stream: Measurement, truth: Array, firs
 
 @partial(jax.jit, static_argnames="model")
 def _as_it_arrives(
-    model: Model, params: Any, arrived: Measurement, truth: Array, first: Bound, times: Array
+    model: Model, params: Params, arrived: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
     order = jnp.argsort(arrived.time, stable=True)
     stream, states = jax.tree.map(lambda x: x[order], (arrived, truth))
@@ -219,7 +221,7 @@ def _as_it_arrives(
 
 @partial(jax.jit, static_argnames="model")
 def _equivalent(
-    model: Model, params: Any, stream: Measurement, truth: Array, first: Bound, times: Array
+    model: Model, params: Params, stream: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
@@ -236,7 +238,7 @@ def _equivalent(
     return lax.scan(body, first, (stream, truth, times))[1]
 
 
-def _moved(model: Model, params: Any, cov: Array, states: Array, t0: Array, t1: Array) -> Array:
+def _moved(model: Model, params: Params, cov: Array, states: Array, t0: Array, t1: Array) -> Array:
     """The bound after the motion of the true states (R, n) from t0 to t1.
 
     With F = E[F] + dF, the inverse of (64) is Q + E[F] (J + E[dF' Q^-1 dF])^-1 E[F]'.
@@ -251,7 +253,7 @@ def _moved(model: Model, params: Any, cov: Array, states: Array, t0: Array, t1: 
     return matmul(matmul(mean, kept), mean.T) + Q
 
 
-def _information(model: Model, params: Any, states: Array, measurement: Measurement) -> Array:
+def _information(model: Model, params: Params, states: Array, measurement: Measurement) -> Array:
     """E[H' R^-1 H] over the true states (R, n)."""
 
     def one(x: Array) -> Array:
@@ -280,12 +282,12 @@ def _informed(cov: Array, information: Array) -> Array:
 
 def _checked(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    truth: Any,
+    truth: Numbers,
     start: Any,
-    prior_cov: Any,
-    t0: Any,
+    prior_cov: Parameter,
+    t0: Numbers,
 ) -> tuple[Measurement, Array, Bound]:
     """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
     truth, after what can be known is checked."""

@@ -1,12 +1,12 @@
 """How much a filter has to remember."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from ewif_jax import checks
-from ewif_jax.types import Estimator, Gaussian
+from ewif_jax.types import Estimator, Gaussian, Params, RandomKey
 
 
 class Storage(NamedTuple):
@@ -18,7 +18,9 @@ class Storage(NamedTuple):
     parts: dict[str, int]
 
 
-def storage(estimator: Estimator, n: int, *, params: Any = None, key: Any = None) -> Storage:
+def storage(
+    estimator: Estimator, n: int, *, params: Params = None, key: RandomKey = None
+) -> Storage:
     """What the state of an estimator holds, read off the state itself without computing it.
 
     A state holds all that the next step needs: the estimate, and whatever a method for late

@@ -21,6 +21,7 @@ from ewif_jax.continuous.kalman_bucy import (
 )
 from ewif_jax.kernels import symmetric
 from ewif_jax.streams import float_dtype
+from ewif_jax.types import Numbers, Parameter, Params
 
 
 class ErrorCurve(NamedTuple):
@@ -44,11 +45,11 @@ class ErrorBounds(NamedTuple):
 
 def actual_error_continuous(
     system: ContinuousSystem,
-    params: Any,
+    params: Params,
     cov0: Any,
     *,
-    times: Any,
-    fading_rate: Any = 0.0,
+    times: Numbers,
+    fading_rate: Parameter = 0.0,
     truth: ContinuousSystem | None = None,
     mean0: Any = None,
     rtol: float | None = None,
@@ -113,11 +114,11 @@ def actual_error_continuous(
 
 def error_bounds_continuous(
     system: ContinuousSystem,
-    params: Any,
+    params: Params,
     cov0: Any,
     *,
-    times: Any,
-    fading_rate: Any = 0.0,
+    times: Numbers,
+    fading_rate: Parameter = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 65_536,
@@ -139,7 +140,7 @@ def error_bounds_continuous(
 def _error_curve(
     functions: tuple,
     constants: tuple,
-    params: Any,
+    params: Params,
     start: tuple[Array, Array],
     times: Array,
     tolerances: tuple,

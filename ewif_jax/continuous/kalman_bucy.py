@@ -14,7 +14,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.anderson_continuous import ContinuousSystem, check_continuous
 from ewif_jax.kernels import symmetric
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Gaussian
+from ewif_jax.types import DTypeLike, Gaussian, Numbers, Parameter, Params
 
 
 class Signal(NamedTuple):
@@ -35,12 +35,12 @@ class Filtered(NamedTuple):
 
 def kalman_bucy(
     system: ContinuousSystem,
-    params: Any,
+    params: Params,
     signal: Signal,
     *,
     prior: Gaussian,
-    times: Any,
-    fading_rate: Any = 0.0,
+    times: Numbers,
+    fading_rate: Parameter = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 65_536,
@@ -97,7 +97,7 @@ def kalman_bucy(
 def _kalman_bucy(
     functions: tuple,
     constants: tuple,
-    params: Any,
+    params: Params,
     signal: Signal,
     prior: Gaussian,
     times: Array,
@@ -147,13 +147,13 @@ def need_diffrax() -> None:
         )
 
 
-def split(values: tuple, dtype: Any) -> tuple[tuple, tuple]:
+def split(values: tuple, dtype: DTypeLike) -> tuple[tuple, tuple]:
     """The functions among `values` (None elsewhere), and the constants (None elsewhere)."""
     functions = tuple(x if callable(x) else None for x in values)
     return functions, tuple(None if callable(x) else jnp.asarray(x, dtype) for x in values)
 
 
-def matrices(functions: tuple, constants: tuple, params: Any) -> Callable[[Array], Instant]:
+def matrices(functions: tuple, constants: tuple, params: Params) -> Callable[[Array], Instant]:
     """F, G, H, Q, R and the fading rate, split, as a function of time."""
 
     def at(t: Array) -> Instant:
@@ -199,7 +199,12 @@ def solve(
 
 
 def check_design(
-    system: ContinuousSystem, fading_rate: Any, params: Any, start: Array, n: int, m: Any = "m"
+    system: ContinuousSystem,
+    fading_rate: Parameter,
+    params: Params,
+    start: Array,
+    n: int,
+    m: Any = "m",
 ) -> None:
     """Refuses a filter's system and fading rate as they are at the `start`."""
     check_continuous("system", system, n, m, params=params, start=start)
@@ -216,7 +221,7 @@ def check_solver(rtol: float | None, atol: float | None, max_steps: int) -> None
     checks.whole("max_steps", max_steps, 1)
 
 
-def check_increasing(name: str, times: Any) -> None:
+def check_increasing(name: str, times: Numbers) -> None:
     """Refuses known times that are not finite, fewer than two, or do not increase."""
     value = checks.known(times)
     if value is not None:
@@ -225,7 +230,7 @@ def check_increasing(name: str, times: Any) -> None:
         checks.require(increasing, name, "at least two increasing times", value)
 
 
-def _check_times(signal: Signal, times: Any) -> None:
+def _check_times(signal: Signal, times: Numbers) -> None:
     checks.shape("signal.time", signal.time, ("S",))
     checks.shape("signal.value", signal.value, (np.shape(signal.time)[0], "m"))
     checks.finite("signal.value", signal.value)

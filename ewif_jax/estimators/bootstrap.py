@@ -1,7 +1,5 @@
 """The bootstrap particle filter."""
 
-from typing import Any
-
 from jax import Array
 
 from ewif_jax.kernels.resampling import Resampling
@@ -11,7 +9,7 @@ from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params
 
 
 @from_recipe
@@ -70,12 +68,12 @@ def bootstrap(
     """
     kind = form.cloud(model, particles, resampling, ess_threshold)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
         return form.drawn(kind, prior, t0, key)
 
     def measure(
-        params: Any, state: ParticleState, measurement: Measurement
+        params: Params, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
         seen = weighing.look(model, params, state.particles, state.log_weights, measurement)
         log_weights, info = weighing.weigh(state, seen, measurement)

@@ -1,6 +1,6 @@
 """The ensemble Kalman filter."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from jax import Array
 
@@ -11,7 +11,7 @@ from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.ensembles import EnsembleState
 from ewif_jax.recursions.innovations import info_of
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params
 
 FORMS = ("stochastic", "square_root")
 
@@ -64,15 +64,15 @@ def ensemble(
     count = checks.whole("members", members, 2)
     checks.require(form in FORMS, "form", f"one of {FORMS}", repr(form))
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> EnsembleState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> EnsembleState:
         del params
         return ensembles.drawn(prior, t0, key, count)
 
-    def move(params: Any, state: EnsembleState, time: Array) -> EnsembleState:
+    def move(params: Params, state: EnsembleState, time: Array) -> EnsembleState:
         return ensembles.moved(model, params, state, time)[0]
 
     def measure(
-        params: Any, state: EnsembleState, measurement: Measurement
+        params: Params, state: EnsembleState, measurement: Measurement
     ) -> tuple[EnsembleState, Info]:
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
         looked = ensembles.look(model, params, state.members, state.members, measurement)
@@ -83,7 +83,7 @@ def ensemble(
         info = info_of(looked.innovation, looked.mask, looked.all_finite)
         return state._replace(members=members, sight=sight), info
 
-    def estimate(params: Any, state: EnsembleState) -> Gaussian:
+    def estimate(params: Params, state: EnsembleState) -> Gaussian:
         del params
         return ensembles.moments(state.members)
 

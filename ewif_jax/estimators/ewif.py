@@ -16,11 +16,13 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params, RandomKey
 
 
 @from_recipe
-def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None = None) -> Estimator:
+def ewif(
+    model: Model, tau: Parameter = None, *, weight: Callable[..., Array] | None = None
+) -> Estimator:
     r"""The least-squares estimate in which a measurement of age s counts exp(-s / tau).
 
     .. math::
@@ -71,7 +73,9 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
     if tau is not None and not callable(tau):
         checks.positive("tau", tau)
 
-    def start(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> InformationState:
+    def start(
+        params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
+    ) -> InformationState:
         del key
         if tau is not None:
             checks.positive("tau", resolve(tau, params))
@@ -81,20 +85,20 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
 
     growing = growth(tau, weight)
 
-    def move(params: Any, state: InformationState, time: Array) -> InformationState:
+    def move(params: Params, state: InformationState, time: Array) -> InformationState:
         return form.transport(model, params, state, time, growing(params, state.time, time))
 
     def measure(
-        params: Any, state: InformationState, measurement: Measurement
+        params: Params, state: InformationState, measurement: Measurement
     ) -> tuple[InformationState, Info]:
         faded = growing(params, measurement.time, state.time)
         return form.absorb(model, params, state, measurement, faded)
 
-    def estimate(params: Any, state: InformationState) -> Gaussian:
+    def estimate(params: Params, state: InformationState) -> Gaussian:
         del params
         return form.estimate(state)
 
-    def any_time(params: Any, state: InformationState, time: Array) -> Array:
+    def any_time(params: Params, state: InformationState, time: Array) -> Array:
         del params, state
         return jnp.isfinite(time)
 
@@ -103,14 +107,16 @@ def ewif(model: Model, tau: Any = None, *, weight: Callable[..., Array] | None =
     return estimator_from(recursion._replace(model=without_process_noise(model)))
 
 
-def growth(tau: Any, weight: Callable[..., Array] | None) -> Callable[[Any, Array, Array], Array]:
+def growth(
+    tau: Parameter, weight: Callable[..., Array] | None
+) -> Callable[[Any, Array, Array], Array]:
     """What variances of time t count at time `now`: (params, t, now) -> 1 / W(t, now)^2."""
 
-    def by_weight(params: Any, measured: Array, now: Array) -> Array:
+    def by_weight(params: Params, measured: Array, now: Array) -> Array:
         assert weight is not None
         return reciprocal_square(jnp.asarray(weight(params, measured, now), now.dtype))
 
-    def by_decay(params: Any, measured: Array, now: Array) -> Array:
+    def by_decay(params: Params, measured: Array, now: Array) -> Array:
         decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), now.dtype)
         return exponential(now - measured, decay)
 

@@ -1,7 +1,6 @@
 """Anderson's Kalman filter with exponential data weighting."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -12,12 +11,12 @@ from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.steps import count_steps
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import covariance_form
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, Parameter, Params
 
 
 @from_recipe
 def fading(
-    model: Model, fading: Any = None, *, inflation: Callable[..., Array] | None = None
+    model: Model, fading: Parameter = None, *, inflation: Callable[..., Array] | None = None
 ) -> Estimator:
     r"""The Kalman filter that weights the data of step k by :math:`\alpha^{2k}`.
 
@@ -56,7 +55,7 @@ def fading(
     if not callable(fading):
         checks.at_least("fading", fading, 1.0)
 
-    def per_step(params: Any, t0: Array, t1: Array) -> Array:
+    def per_step(params: Params, t0: Array, t1: Array) -> Array:
         alpha = checks.at_least("fading", resolve(fading, params), 1.0)
         checks.shape("fading", alpha, ())
         if model.steps is None:

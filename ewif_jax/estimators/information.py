@@ -1,7 +1,5 @@
 """The Kalman filter in information form."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,7 +12,7 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_one_way
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
 
 
 @from_recipe
@@ -38,24 +36,26 @@ def information(model: Model) -> Estimator:
     """
     need_linear(model, "information")
 
-    def start(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> InformationState:
+    def start(
+        params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
+    ) -> InformationState:
         del key
         if prior is None:
             need_reversible(model, "information with prior=None")
             refuse_one_way(model, params, "information with prior=None")
         return form.start(model, params, prior, t0)
 
-    def move(params: Any, state: InformationState, time: Array) -> InformationState:
+    def move(params: Params, state: InformationState, time: Array) -> InformationState:
         Q = jnp.asarray(model.process_cov(params, state.time, time), state.mean.dtype)
         checks.shape("Q", Q, (state.mean.shape[0],) * 2)
         return form.transport(model, params, state, time, 1.0, cholesky.factor(Q).lower)
 
     def measure(
-        params: Any, state: InformationState, measurement: Measurement
+        params: Params, state: InformationState, measurement: Measurement
     ) -> tuple[InformationState, Info]:
         return form.absorb(model, params, state, measurement, 1.0, exact=True)
 
-    def estimate(params: Any, state: InformationState) -> Gaussian:
+    def estimate(params: Params, state: InformationState) -> Gaussian:
         del params
         return form.estimate(state)
 

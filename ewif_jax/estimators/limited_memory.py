@@ -1,7 +1,7 @@
 """The limited-memory filter: least squares over a sliding window."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params, RandomKey
 
 
 class WindowState(NamedTuple):
@@ -28,7 +28,7 @@ class WindowState(NamedTuple):
 
 
 @from_recipe
-def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
+def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
     r"""The least-squares estimate from the measurements of the last `window` seconds.
 
     .. math::
@@ -60,7 +60,9 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
     if not callable(window):
         checks.positive("window", window)
 
-    def first_state(params: Any, prior: Gaussian | None, t0: Array, key: Any) -> WindowState:
+    def first_state(
+        params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
+    ) -> WindowState:
         del key
         checks.positive("window", resolve(window, params))
         refuse_exact(model, params, t0, "limited_memory")
@@ -77,7 +79,7 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         )
         return WindowState(start.time, start, buffer)
 
-    def fit(params: Any, state: WindowState, time: Array) -> InformationState:
+    def fit(params: Params, state: WindowState, time: Array) -> InformationState:
         """Everything inside the window, at `time`."""
         half = resolve(window, params)
         inside = jnp.abs(time - state.start.time) <= half
@@ -94,16 +96,16 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         flat = told.reshape(-1, told.shape[-1]), noise.ravel(), targets.ravel()
         return form.recentred(form.gathered(base, *flat))
 
-    def move(params: Any, state: WindowState, time: Array) -> WindowState:
+    def move(params: Params, state: WindowState, time: Array) -> WindowState:
         del params
         return state._replace(time=time)
 
-    def is_inside(params: Any, state: WindowState, time: Array) -> Array:
+    def is_inside(params: Params, state: WindowState, time: Array) -> Array:
         in_window = state.time - time <= resolve(window, params)
         return in_window & (time >= jnp.min(state.buffer.time))
 
     def measure(
-        params: Any, state: WindowState, measurement: Measurement
+        params: Params, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
         oldest = jnp.argmin(state.buffer.time)
         buffer = jax.tree.map(lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement)
@@ -111,7 +113,7 @@ def limited_memory(model: Model, window: Any, capacity: int) -> Estimator:
         _, info = form.absorb(model, params, before, measurement, 1.0)
         return state._replace(buffer=buffer), info
 
-    def estimate(params: Any, state: WindowState) -> Gaussian:
+    def estimate(params: Params, state: WindowState) -> Gaussian:
         return form.estimate(fit(params, state, state.time))
 
     recursion = Recursion("limited_memory", first_state, move, measure, estimate, is_inside)

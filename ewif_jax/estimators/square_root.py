@@ -1,6 +1,6 @@
 """The Kalman filter on a square root of the covariance."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -12,7 +12,7 @@ from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, info_of
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
 
 
 class RootState(NamedTuple):
@@ -43,17 +43,19 @@ def square_root(model: Model) -> Estimator:
     """
     need_linear(model, "square_root")
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> RootState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> RootState:
         del params, key
         return RootState(t0, prior.mean, cholesky.factor(prior.cov).lower)
 
-    def move(params: Any, state: RootState, time: Array) -> RootState:
+    def move(params: Params, state: RootState, time: Array) -> RootState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
         # Made triangular again it would be the same but for its rounding.
         return RootState(time, mean, jnp.where(time > state.time, root, state.root))
 
-    def measure(params: Any, state: RootState, measurement: Measurement) -> tuple[RootState, Info]:
+    def measure(
+        params: Params, state: RootState, measurement: Measurement
+    ) -> tuple[RootState, Info]:
         difference, H, R, mask = compared(model, params, state.mean, measurement)
         m, n = H.shape
         seen = jnp.where(mask[:, None], H @ state.root, 0)
@@ -72,7 +74,7 @@ def square_root(model: Model) -> Estimator:
         updated = RootState(state.time, state.mean + crossed @ white, root)
         return updated, info_of(innovation, mask)
 
-    def estimate(params: Any, state: RootState) -> Gaussian:
+    def estimate(params: Params, state: RootState) -> Gaussian:
         del params
         return Gaussian(state.mean, state.root @ state.root.T)
 

@@ -1,7 +1,5 @@
 """The unscented Kalman filter."""
 
-from typing import Any
-
 from jax import Array
 
 from ewif_jax import checks
@@ -12,12 +10,12 @@ from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.sigma_points import SigmaPoints, measure_around, move_around, transform
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params, RandomKey
 
 
 @from_recipe
 def unscented(
-    model: Model, ut_alpha: Any = 1.0, ut_beta: Any = 0.0, ut_kappa: Any = 0.0
+    model: Model, ut_alpha: Parameter = 1.0, ut_beta: Parameter = 0.0, ut_kappa: Parameter = 0.0
 ) -> Estimator:
     r"""The Kalman filter whose moments come from 2n + 1 points of the model, not from Jacobians.
 
@@ -56,23 +54,23 @@ def unscented(
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> CovarianceState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> CovarianceState:
         del key
         transform(points, params, prior.mean.shape[0], prior.mean.dtype)
         return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
-    def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+    def move(params: Params, state: CovarianceState, time: Array) -> CovarianceState:
         mean, cov = move_around(model, points, params, state.mean, state.cov, state.time, time)
         # Points drawn to stand still would round what they stand for.
         return choose(time > state.time, CovarianceState(time, mean, cov), state)
 
     def measure(
-        params: Any, state: CovarianceState, measurement: Measurement
+        params: Params, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
         mean, cov, info = measure_around(model, points, params, state.mean, state.cov, measurement)
         return CovarianceState(state.time, mean, cov), info
 
-    def estimate(params: Any, state: CovarianceState) -> Gaussian:
+    def estimate(params: Params, state: CovarianceState) -> Gaussian:
         del params
         return Gaussian(state.mean, symmetric.unpack(state.cov))
 

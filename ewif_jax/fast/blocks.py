@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ewif_jax.types import PyTree, State
+
 
 class Portion(NamedTuple):
     """What is done at once."""
@@ -30,7 +32,7 @@ class Place(NamedTuple):
 
 def scan_in_blocks(
     step: Callable[[Any, Any], tuple[Any, Any]],
-    state: Any,
+    state: State,
     arrivals: Any,
     finish: Callable[[Any], Any],
     portion: Portion,
@@ -49,7 +51,7 @@ def scan_in_blocks(
     numbered = jnp.arange(steps), arrivals
     blocks = jax.tree.map(lambda x: x.reshape(steps // block, block, *x.shape[1:]), numbered)
 
-    def numbered_step(state: Any, numbered: Any) -> tuple[Any, Any]:
+    def numbered_step(state: State, numbered: PyTree) -> tuple[Any, Any]:
         k, arrival = numbered
         if portion.together:  # otherwise several threads would take part in reading from the whole
             whole = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), arrivals)
@@ -57,7 +59,7 @@ def scan_in_blocks(
         return step(state, arrival)
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def several(state: Any, numbered: Any) -> tuple[Any, Any]:
+    def several(state: State, numbered: PyTree) -> tuple[Any, Any]:
         state, seen = lax.scan(numbered_step, state, numbered)
         return state, finish(seen)
 
@@ -66,7 +68,7 @@ def scan_in_blocks(
     shapes = jax.tree.map(lambda x: x.update(shape=(len(x), steps, *x.shape[2:])), shapes)
     whole, row, known = (rows(shapes), 0, 0) if place is None else place
 
-    def put(carry: Any, numbered: Any) -> tuple[Any, None]:
+    def put(carry: PyTree, numbered: PyTree) -> tuple[Any, None]:
         state, whole = carry
         number, some = numbered
         state, seen = several(state, some)

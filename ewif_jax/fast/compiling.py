@@ -15,6 +15,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from ewif_jax import checks
 from ewif_jax.plain import native
+from ewif_jax.types import DTypeLike, Numbers
 
 QUICK: Mapping[str, Any] = {
     "xla_cpu_use_fusion_emitters": False,
@@ -103,7 +104,7 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
     return call
 
 
-def array(x: Any, dtype: Any = None) -> jax.Array:
+def array(x: Numbers, dtype: DTypeLike = None) -> jax.Array:
     """`x` as an array of JAX. Of an array of NumPy `jnp.asarray` makes it with a program, compiled
     for every shape; this makes it with none."""
     if isinstance(x, np.ndarray):

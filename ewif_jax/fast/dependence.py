@@ -7,6 +7,8 @@ import jax
 from jax import Array
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
+from ewif_jax.types import PyTree
+
 
 class Traced(NamedTuple):
     """A function as its equations."""
@@ -21,7 +23,7 @@ def traced(fn: Callable[..., Any], *args: Any) -> Traced:
     return Traced(*jax.make_jaxpr(fn, return_shape=True)(*args))
 
 
-def dependence(fn: Traced, flags: Any) -> Any:
+def dependence(fn: Traced, flags: PyTree) -> Any:
     """Which outputs can depend on the flagged inputs (a pytree of bools; never too few)."""
     level = _levels(fn, [int(f) for f in jax.tree.leaves(flags)])
     found = [level(v) > 0 for v in fn.closed.jaxpr.outvars]
@@ -39,7 +41,7 @@ class Divided(NamedTuple):
     """Bytes of what the rest needs."""
 
 
-def divided(fn: Traced, levels: Any, flags: Any) -> Divided:
+def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
     """`fn` in two: what can be computed without the inputs of level 2, and the rest.
 
     Args:

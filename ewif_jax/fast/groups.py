@@ -13,6 +13,7 @@ from ewif_jax.fast.blocks import Place, Portion, like, rows, unrolled
 from ewif_jax.fast.compiling import WHOLE_LOOPS_BELOW, loops_are_joined
 from ewif_jax.fast.dependence import Traced
 from ewif_jax.fast.layout import joined, parted, runs_last
+from ewif_jax.types import PyTree
 
 
 class Sizes(NamedTuple):
@@ -147,8 +148,8 @@ def _work(runs: int, size: int, itemsize: int) -> float:
 
 def in_groups(
     fn: Callable[[Any, Place | None], tuple[Any, Any]],
-    inputs: Any,
-    flags: Any,
+    inputs: PyTree,
+    flags: PyTree,
     runs: int,
     portion: Portion,
 ) -> tuple[Any, Any]:
@@ -185,7 +186,7 @@ def in_groups(
             x = jnp.concatenate([x[: begins[-2] + size], x[begins[-1] :]])
         return x.reshape(groups, size, *x.shape[1:])
 
-    def one(whole: Any, numbered: Any) -> tuple[Any, Any]:
+    def one(whole: Any, numbered: PyTree) -> tuple[Any, Any]:
         begin, known, group = numbered
         return fn(merged(group, begin), Place(whole, begin, known))
 

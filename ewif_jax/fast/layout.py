@@ -13,6 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from ewif_jax import checks
 from ewif_jax.fast.batched import contiguous, turned
 from ewif_jax.fast.compiling import transformed
+from ewif_jax.types import Numbers, PyTree
 
 
 def vmap_last(
@@ -27,32 +28,32 @@ def vmap_last(
     return jax.vmap(fn, in_axes, out_axes, axis_size=runs) if flagged else fn
 
 
-def parted(tree: Any, flags: Any) -> tuple[list[Any], list[Any]]:
+def parted(tree: PyTree, flags: PyTree) -> tuple[list[Any], list[Any]]:
     """The leaves that are flagged, and the others."""
     pairs = list(zip(jax.tree.leaves(tree), jax.tree.leaves(flags), strict=True))
     return [x for x, f in pairs if f], [x for x, f in pairs if not f]
 
 
-def joined(flagged: Sequence[Any], others: Sequence[Any], flags: Any) -> Any:
+def joined(flagged: Sequence[Any], others: Sequence[Any], flags: PyTree) -> Any:
     """The tree whose leaves `parted` would part into these."""
     marked, rest = iter(flagged), iter(others)
     return jax.tree.map(lambda f: next(marked) if f else next(rest), flags)
 
 
-def one_run(tree: Any, flags: Any, k: int = 0) -> Any:
+def one_run(tree: PyTree, flags: PyTree, k: int = 0) -> Any:
     """Number k along the leading axis of the flagged leaves; NumPy stays NumPy, known known."""
 
-    def one(x: Any, flag: bool) -> Any:
+    def one(x: Numbers, flag: bool) -> Any:
         known = checks.known(x) if flag and not _is_key(x) else None
         return x if not flag else x[k] if known is None else known[k]
 
     return jax.tree.map(one, tree, flags)
 
 
-def runs_last(tree: Any, flags: Any) -> Any:
+def runs_last(tree: PyTree, flags: PyTree) -> Any:
     """The flagged leaves with their leading axis moved to the end."""
 
-    def trailing(x: Any, flag: bool) -> Any:
+    def trailing(x: Numbers, flag: bool) -> Any:
         if not flag or jnp.ndim(x) == 1:
             return x
         x = jnp.asarray(x)
@@ -61,7 +62,7 @@ def runs_last(tree: Any, flags: Any) -> Any:
     return jax.tree.map(trailing, tree, flags)
 
 
-def runs_first(tree: Any, flags: Any, runs: int) -> Any:
+def runs_first(tree: PyTree, flags: PyTree, runs: int) -> Any:
     """Every leaf with the run axis in front, repeated where it was shared."""
 
     def leading(x: Array, flag: bool) -> Array:
@@ -74,7 +75,7 @@ def runs_first(tree: Any, flags: Any, runs: int) -> Any:
     return jax.tree.map(leading, tree, flags)
 
 
-def runs_adjacent(tree: Any, flags: Any) -> Any:
+def runs_adjacent(tree: PyTree, flags: PyTree) -> Any:
     """The flagged leaves with the runs adjacent in memory."""
 
     def adjacent(x: Array, flag: bool) -> Array:
@@ -94,7 +95,7 @@ def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
 
 
-def on_devices(tree: Any, flags: Any, devices: int) -> Any:
+def on_devices(tree: PyTree, flags: PyTree, devices: int) -> Any:
     """The known leaves put where `over_devices` wants them, wherever they were."""
     if devices == 1:
         return tree
@@ -110,7 +111,7 @@ def on_devices(tree: Any, flags: Any, devices: int) -> Any:
     return structure.unflatten(leaves)
 
 
-def _on_host(x: Any) -> Any:
+def _on_host(x: Numbers) -> Any:
     """An array of one CPU device as a NumPy view of its memory, which goes to others uncopied."""
     if not isinstance(x, Array) or _is_key(x):
         return x
@@ -136,7 +137,7 @@ def device_count(runs: int, devices: int | None) -> int:
     return max(d for d in range(1, limit + 1) if runs % d == 0)
 
 
-def broadcast_prefix(prefix: Any, tree: Any) -> Any:
+def broadcast_prefix(prefix: Any, tree: PyTree) -> Any:
     """A pytree of bools like `tree` from a prefix of it."""
     return jax.tree.map(bool, jax.tree.broadcast(prefix, tree))
 
@@ -144,7 +145,7 @@ def broadcast_prefix(prefix: Any, tree: Any) -> Any:
 class Frozen:
     """A pytree of bools as a hashable static argument."""
 
-    def __init__(self, tree: Any):
+    def __init__(self, tree: PyTree):
         self.tree = tree
         leaves, structure = jax.tree.flatten(tree)
         self._id = (tuple(leaves), structure)
@@ -156,5 +157,5 @@ class Frozen:
         return isinstance(other, Frozen) and self._id == other._id
 
 
-def _is_key(x: Any) -> bool:
+def _is_key(x: Numbers) -> bool:
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

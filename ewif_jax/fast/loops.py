@@ -24,6 +24,7 @@ from ewif_jax.fast.layout import (
     runs_first,
     vmap_last,
 )
+from ewif_jax.types import Numbers, Params, PyTree, RandomKey, State
 
 
 class Loop(NamedTuple):
@@ -72,7 +73,7 @@ class OneRun(NamedTuple):
 
 
 def over_runs(
-    loop: Loop, estimate: Callable[[Any, Any], Any], inputs: Any, flags: Any
+    loop: Loop, estimate: Callable[[Any, Any], Any], inputs: PyTree, flags: PyTree
 ) -> tuple[Any, Any]:
     """What is observed (R, T, ...) and the final states (R, ...).
 
@@ -137,7 +138,7 @@ def _that_differ(step: Traced, params_f: Any, state_f: Any, arrival_f: Any) -> t
         state_f = either
 
 
-def _levels(flags: Any, shared: int) -> Any:
+def _levels(flags: PyTree, shared: int) -> Any:
     return jax.tree.map(lambda f: 2 if f else shared, flags)
 
 
@@ -145,7 +146,7 @@ def _first(arrivals: Any) -> Any:
     return jax.tree.map(lambda x: x[0], arrivals)
 
 
-def _sizes(state: Any, state_f: Any, shown: Any) -> tuple[int, int, int]:
+def _sizes(state: State, state_f: Any, shown: Any) -> tuple[int, int, int]:
     """The bytes of a run's own state, of the state that all share, and of the largest array in one
     or in an estimate."""
     sizes, estimated = (
@@ -178,10 +179,10 @@ def _shared_ahead(
     arrivals = parted(inputs.arrivals, per_run.arrivals)[1]
     last, (seen, needed) = lax.scan(step_ahead, state, arrivals, steps)
 
-    def start(params: Any, prior: Any, key: Any) -> Any:
+    def start(params: Params, prior: Any, key: RandomKey) -> Any:
         return parted(loop.start(params, prior, key), state_differs)[0]
 
-    def step(params: Any, state: list[Array], arrival: Any) -> tuple[Any, Any]:
+    def step(params: Params, state: list[Array], arrival: Numbers) -> tuple[Any, Any]:
         measurement, time, (seen, needed) = arrival
         own = parted((measurement, time, seen), per_run.arrivals)[0]
         outputs = parts.rest([*jax.tree.leaves(params), *state, *own], needed)
@@ -213,7 +214,7 @@ def _in_groups(
     return in_groups(group, inputs, per_run, inputs.measurements.value.shape[0], portion)
 
 
-def _alike(flags: Any) -> Any:
+def _alike(flags: PyTree) -> Any:
     return jax.tree.map(lambda _: False, flags)
 
 
@@ -232,7 +233,7 @@ def _scanned(
     flags = per_run.params, state_differs, per_run.arrivals
     step = vmap_last(loop.step, flags, (state_differs, seen_differs), runs)
 
-    def arrive(state: Any, arrival: Any) -> tuple[Any, Any]:
+    def arrive(state: State, arrival: Numbers) -> tuple[Any, Any]:
         state, seen = step(inputs.params, runs_adjacent(state, state_differs), arrival)
         return runs_adjacent(state, state_differs), seen
 

@@ -1,13 +1,13 @@
 """Growing variances, within what their dtype can square and divide by."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from ewif_jax.types import DTypeLike
 
-def largest_variance(dtype: Any) -> float:
+
+def largest_variance(dtype: DTypeLike) -> float:
     """How large a variance may become. The derivative of an update divides by squares of variances:
     they and their reciprocals have to be ordinary numbers."""
     return float(jnp.finfo(dtype).max) ** 0.4

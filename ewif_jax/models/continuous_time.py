@@ -18,6 +18,7 @@ from ewif_jax.models.parameters import named
 from ewif_jax.models.powers import Stride, then
 from ewif_jax.models.sensors import Sensor, bank
 from ewif_jax.recipe import from_recipe
+from ewif_jax.types import DTypeLike, Numbers, Parameter, Params
 
 TERMS = 19
 """Of each series: what is left out is below 1 / 20! where the norm of A dt is at most 1/2."""
@@ -32,9 +33,9 @@ def from_continuous(
     intensity: Any,
     sensors: Sensor | Sequence[Sensor] | None = None,
     *,
-    H: Any = None,
-    R: Any = None,
-    b: Any = None,
+    H: Parameter = None,
+    R: Parameter = None,
+    b: Parameter = None,
 ) -> Model:
     r"""The linear model of :math:`dx = (A x + b)\,dt + G\,dw` over any interval, also backwards.
 
@@ -86,7 +87,7 @@ def from_continuous(
     if isinstance(intensity, np.ndarray):
         checks.psd("intensity", _squared_up(intensity, np))
 
-    def drift_over(params: Any, t0: Any, t1: Any) -> tuple[Array, Array]:
+    def drift_over(params: Params, t0: Numbers, t1: Numbers) -> tuple[Array, Array]:
         """A (n, n) in the direction of time, and the length of the interval."""
         drift, dt = _valued(A, params), domain.floating(t1) - domain.floating(t0)
         checks.shape("A", drift, (drift.shape[0],) * 2)
@@ -94,7 +95,7 @@ def from_continuous(
         drift, dt = drift.astype(dtype), dt.astype(dtype)
         return jnp.where(dt < 0, -drift, drift), jnp.where(dt < 0, -dt, dt)
 
-    def noise_of(params: Any, dtype: Any) -> Array:
+    def noise_of(params: Params, dtype: DTypeLike) -> Array:
         drive = _valued(G, params).astype(dtype)
         checks.shape("G", drive, ("n", "k"))
         k = drive.shape[1]
@@ -104,14 +105,14 @@ def from_continuous(
         checks.shape("intensity", q, (k, k))
         return matmul(matmul(drive, q), drive.T)
 
-    def F(params: Any, t0: Array, t1: Array) -> Array:
+    def F(params: Params, t0: Array, t1: Array) -> Array:
         return integrated(*drift_over(params, t0, t1))[0]
 
-    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+    def process_cov(params: Params, t0: Array, t1: Array) -> Array:
         drift, dt = drift_over(params, t0, t1)
         return integrated(drift, dt, noise=noise_of(params, drift.dtype))[1]
 
-    def gathered(params: Any, t0: Array, t1: Array) -> Array:
+    def gathered(params: Params, t0: Array, t1: Array) -> Array:
         drift, dt = drift_over(params, t0, t1)
         push = _valued(b, params).astype(drift.dtype)
         checks.shape("b", push, drift.shape[:1])
@@ -126,7 +127,7 @@ def from_continuous(
         if matrix is not None:
             if callable(A):  # its size is known when it is asked
 
-                def H_of(params: Any, sensor: Array, t: Array) -> Array:
+                def H_of(params: Params, sensor: Array, t: Array) -> Array:
                     size = jax.eval_shape(lambda: _valued(A, params)).shape[0]
                     return matrix(size)[0](params, sensor, t)
 
@@ -146,7 +147,7 @@ def from_continuous(
         )
     check_seen = seen.check
 
-    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+    def check(params: Params, t0: Numbers, t1: Numbers, sensors: Numbers) -> None:
         if callable(intensity) and t1 > t0:
             checks.psd("intensity", _squared_up(np.asarray(intensity(params)), np))
         if check_seen is not None:
@@ -205,7 +206,7 @@ def _twice(stride: Stride) -> Stride:
     return then(stride, stride, matmul, matvec)
 
 
-def _given(argument: str, value: Any) -> Any:
+def _given(argument: str, value: Numbers) -> Any:
     """An array of NumPy, or a function of `params`, or None; what is not finite is refused."""
     if value is None:
         return None
@@ -217,12 +218,12 @@ def _given(argument: str, value: Any) -> Any:
     return np.array(value, float)
 
 
-def _valued(value: Any, params: Any) -> Array:
+def _valued(value: Numbers, params: Params) -> Array:
     """What it is for these parameters."""
     return domain.floating(value(params) if callable(value) else value)
 
 
-def _squared_up(q: Any, xp: Any) -> Any:
+def _squared_up(q: Parameter, xp: Any) -> Any:
     """An intensity as a matrix: of a number (1, 1), of variances (k, k)."""
     q = xp.atleast_1d(xp.asarray(q))
     return xp.diag(q) if q.ndim == 1 else q

@@ -13,6 +13,7 @@ from ewif_jax.models.model import Model
 from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bank
 from ewif_jax.recipe import from_recipe
+from ewif_jax.types import Numbers, Parameter, Params
 
 STRAIGHT = np.zeros((3, 5, 5))
 STRAIGHT[:, :4, :4] = [
@@ -25,7 +26,7 @@ TURNING = np.diag([0.0, 0.0, 0.0, 0.0, 1.0])
 
 @from_recipe
 def coordinated_turn(
-    *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, q_turn: Any = 0.0
+    *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, q_turn: Any = 0.0
 ) -> Model:
     r"""Motion in the plane at a constant, unknown turn rate, with Cartesian velocity.
 
@@ -66,7 +67,7 @@ def coordinated_turn(
     observe, cov, residual, _, count = bank(sensors)
     check_seen = domain.check_covariances(None, cov)
 
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
+    def transition(params: Params, x: Array, t0: Array, t1: Array) -> Array:
         del params
         checks.shape("state", x, (5,))
         dt = t1 - t0
@@ -84,7 +85,7 @@ def coordinated_turn(
             ]
         )
 
-    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+    def process_cov(params: Params, t0: Array, t1: Array) -> Array:
         dt = jnp.abs(jnp.asarray(t1 - t0))
         straight, turning = jnp.asarray(STRAIGHT, dt.dtype), jnp.asarray(TURNING, dt.dtype)
         moving = straight[0] * dt + straight[1] * dt**2 + straight[2] * dt**3
@@ -92,7 +93,7 @@ def coordinated_turn(
         turned = domain.scaled(domain.variance("q_turn", q_turn, params), dt * turning)
         return driven + turned.astype(driven.dtype)
 
-    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+    def check(params: Params, t0: Numbers, t1: Numbers, sensors: Numbers) -> None:
         if t1 > t0:
             for argument, density in (("q", q), ("q_turn", q_turn)):
                 domain.check_variance(argument, resolve(density, params))

@@ -15,17 +15,17 @@ from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
 from ewif_jax.models.powers import Stride, chosen, looked_up, power, squares_of, tables_of
 from ewif_jax.models.steps import count_steps
-from ewif_jax.types import Steps
+from ewif_jax.types import Numbers, Parameter, Params, Steps
 
 Function = Callable[..., Array]
 
 
-def is_discrete(value: Any) -> bool:
+def is_discrete(value: Numbers) -> bool:
     """Whether it speaks of one step: an array, or a function of `params` alone."""
     return value is not None and (not callable(value) or of_params(value))
 
 
-def constant(argument: str, value: Any, expected: tuple[int | str, ...]) -> Any:
+def constant(argument: str, value: Numbers, expected: tuple[int | str, ...]) -> Any:
     """A discrete F, Q or b as an array of NumPy or a function of `params`; what is refused, is."""
     if callable(value):
         return partial(_read, named(value))
@@ -36,16 +36,16 @@ def constant(argument: str, value: Any, expected: tuple[int | str, ...]) -> Any:
     return np.array(value, float)
 
 
-def _read(value: Function, params: Any) -> Any:
+def _read(value: Function, params: Params) -> Any:
     return value(params)
 
 
-def full_rank(F: Any) -> bool:
+def full_rank(F: Parameter) -> bool:
     """Whether a constant F has an inverse; True where that is not known."""
     return not isinstance(F, np.ndarray) or bool(np.linalg.matrix_rank(F) == F.shape[0])
 
 
-def pattern_of_powers(F: Any) -> Pattern | None:
+def pattern_of_powers(F: Parameter) -> Pattern | None:
     """Where any power of a constant F, and so its inverse, may differ from zero."""
     if not isinstance(F, np.ndarray):
         return None
@@ -64,7 +64,7 @@ class Motion(NamedTuple):
     reversible: bool
 
 
-def motion(F: Any, Q: Any, b: Any, steps: Steps) -> Motion:
+def motion(F: Parameter, Q: Parameter, b: Parameter, steps: Steps) -> Motion:
     """What F, Q and b of one step, or of intervals, say of any interval."""
     for argument, value in (("Q", Q), ("b", b)):
         checks.require(
@@ -88,12 +88,12 @@ def motion(F: Any, Q: Any, b: Any, steps: Steps) -> Motion:
     )
 
 
-def transition_of_steps(F: Any, steps: Steps) -> Function:
+def transition_of_steps(F: Parameter, steps: Steps) -> Function:
     """F^k (n, n) as a function of (params, t0, t1), in either direction."""
     if isinstance(F, np.ndarray):
         return _powers_of_constant(F, steps)
 
-    def matrix(params: Any, t0: Array, t1: Array) -> Array:
+    def matrix(params: Params, t0: Array, t1: Array) -> Array:
         first = _first("F", F, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
@@ -112,13 +112,13 @@ def transition_of_steps(F: Any, steps: Steps) -> Function:
     return matrix
 
 
-def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
+def input_of_steps(F: Parameter, b: Parameter, steps: Steps) -> Function:
     """The input (n,) gathered from t0 to t1 >= t0, as a function of (params, t0, t1)."""
     is_table = isinstance(F, np.ndarray) and isinstance(b, np.ndarray)
     tables = tables_of(Stride(F, b=b), steps) if is_table else []
     squares = squares_of(F, steps)
 
-    def gathered(params: Any, t0: Array, t1: Array) -> Array:
+    def gathered(params: Params, t0: Array, t1: Array) -> Array:
         first = _first("b", b, params, ("n",))
         k, whole = count_steps(steps, t0, t1)
 
@@ -136,13 +136,13 @@ def input_of_steps(F: Any, b: Any, steps: Steps) -> Function:
     return gathered
 
 
-def noise_of_steps(F: Any, Q: Any, steps: Steps) -> Function:
+def noise_of_steps(F: Parameter, Q: Parameter, steps: Steps) -> Function:
     """Q (n, n) from t0 to t1 as a function of (params, t0, t1), zero against time."""
     is_table = isinstance(F, np.ndarray) and isinstance(Q, np.ndarray)
     tables = tables_of(Stride(F, Q=Q), steps) if is_table else []
     squares = squares_of(F, steps)
 
-    def summed(params: Any, t0: Array, t1: Array) -> Array:
+    def summed(params: Params, t0: Array, t1: Array) -> Array:
         first = _first("Q", Q, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
 
@@ -169,7 +169,7 @@ def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
         )
     ]
 
-    def matrix(params: Any, t0: Array, t1: Array) -> Array:
+    def matrix(params: Params, t0: Array, t1: Array) -> Array:
         del params
         k, whole = count_steps(steps, t0, t1)
 
@@ -187,7 +187,7 @@ def _nothing(still: Array, whole: Any) -> Array:
     return chosen(whole, still, jnp.full_like(still, jnp.nan))
 
 
-def _first(argument: str, value: Any, params: Any, expected: tuple[int | str, ...]) -> Array:
+def _first(argument: str, value: Numbers, params: Params, expected: tuple[int | str, ...]) -> Array:
     """What a discrete F, Q or b is for one step."""
     made = array(value(params) if callable(value) else value)
     checks.shape(argument, made, expected)

@@ -10,12 +10,13 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models.parameters import resolve
+from ewif_jax.types import Numbers, Params
 
 ROUNDING = 1e-5
 """How far below zero, as a share of the largest variance, rounding may take an eigenvalue."""
 
 
-def floating(value: Any) -> Array:
+def floating(value: Numbers) -> Array:
     """As an array of floats: whole numbers are numbers too."""
     value = jnp.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
@@ -29,7 +30,7 @@ def scaled(factor: Any, matrix: Array) -> Array:
     return factor.astype(dtype) * matrix.astype(dtype)
 
 
-def variance(argument: str, value: Any, params: Any) -> Any:
+def variance(argument: str, value: Numbers, params: Params) -> Any:
     """A variance or density () read from `params`; NaN if it turns out to be none."""
     found = resolve(value, params)
     check_variance(argument, found)
@@ -39,14 +40,14 @@ def variance(argument: str, value: Any, params: Any) -> Any:
     return jnp.where((found >= 0) & (found < jnp.inf), found, jnp.nan)
 
 
-def check_variance(argument: str, value: Any) -> None:
+def check_variance(argument: str, value: Numbers) -> None:
     """Refuses a known number that is no variance."""
     checks.shape(argument, value, ())
     checks.at_least(argument, value, 0.0)
     checks.finite(argument, value)
 
 
-def covariance(argument: str, value: Any) -> Array:
+def covariance(argument: str, value: Numbers) -> Array:
     """A covariance (m, m); NaN if it turns out to be none, by its variances and correlations."""
     known = checks.known(value)
     if known is not None:
@@ -67,7 +68,7 @@ def check_covariances(Q: Callable[..., Any] | None, R: Callable[..., Any] | None
     """A check (params, t0, t1, sensors) that Q(params, t0, t1) and R(params, sensor, t1) of known
     parameters are covariances; of no interval (t0 = t1) Q is not asked."""
 
-    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+    def check(params: Params, t0: Numbers, t1: Numbers, sensors: Numbers) -> None:
         if Q is not None and t1 > t0:
             check_covariance("Q", Q(params, t0, t1))
         if R is not None:
@@ -77,6 +78,6 @@ def check_covariances(Q: Callable[..., Any] | None, R: Callable[..., Any] | None
     return check
 
 
-def check_covariance(argument: str, value: Any) -> None:
+def check_covariance(argument: str, value: Numbers) -> None:
     """Refuses a known matrix that is no covariance, or is not known to be one."""
     checks.psd(argument, value)

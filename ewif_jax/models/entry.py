@@ -12,15 +12,15 @@ from ewif_jax import checks
 from ewif_jax.models.domain import check_covariances
 from ewif_jax.models.model import Model
 from ewif_jax.models.steps import check_steps
-from ewif_jax.types import Measurement
+from ewif_jax.types import DTypeLike, Measurement, Numbers, Params
 
 
 def check_times(
     model: Model | None,
     measurements: Measurement,
-    t0: Any,
-    dtype: Any,
-    times: Any = None,
+    t0: Numbers,
+    dtype: DTypeLike,
+    times: Numbers = None,
     in_order: bool = True,
 ) -> None:
     """Refuses known times of measurements (..., T) and of reports that lie between two steps of a
@@ -41,7 +41,7 @@ def check_times(
         check_steps(model.steps, times, t0, dtype, "times", in_order=False)
 
 
-def check_span(model: Model, sources: Any, times: Any) -> None:
+def check_span(model: Model, sources: Any, times: Numbers) -> None:
     """Refuses known times (K,) to which something known of `sources` (arrays of times, or None)
     would have to be moved over too many steps at once."""
     if model.steps is None:
@@ -69,14 +69,14 @@ def without_process_noise(model: Model) -> Model:
 
 
 def _of_measurements(
-    check: Callable[..., None], params: Any, t0: Any, t1: Any, sensors: Any
+    check: Callable[..., None], params: Params, t0: Numbers, t1: Numbers, sensors: Numbers
 ) -> None:
     del t0
     check(params, t1, t1, sensors)
 
 
 def check_covariances_of(
-    model: Model | None, params: Any, t0: Any, times: Any, sensors: Any
+    model: Model | None, params: Params, t0: Numbers, times: Numbers, sensors: Numbers
 ) -> None:
     """Refuses known parameters that make a Q or R of the model that is no covariance.
 

@@ -6,7 +6,7 @@ The state lists the position first, then the velocity, then the acceleration: [x
 from collections.abc import Callable, Sequence
 from functools import cache
 from math import factorial
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,13 +20,14 @@ from ewif_jax.models.model import Linear, Model, affine_motion
 from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, bank
 from ewif_jax.recipe import from_recipe
+from ewif_jax.types import Numbers, Parameter, Params
 
 Function = Callable[[Array], Array]
 
 
 @from_recipe
 def random_walk(
-    *, sensors: Sensor | Sequence[Sensor], q: Any = 0.0, dims: int = 1, b: Any = None
+    *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, dims: int = 1, b: Parameter = None
 ) -> Model:
     r"""Position driven by white noise: :math:`Q = q\,\Delta t`, q in m^2/s."""
     return _kinematic(0, sensors, q, dims, "white", b)
@@ -36,10 +37,10 @@ def random_walk(
 def constant_velocity(
     *,
     sensors: Sensor | Sequence[Sensor],
-    q: Any = 0.0,
+    q: Parameter = 0.0,
     dims: int = 1,
     noise: Literal["white", "discrete"] = "white",
-    b: Any = None,
+    b: Parameter = None,
 ) -> Model:
     r"""Nearly constant velocity.
 
@@ -61,10 +62,10 @@ def constant_velocity(
 def constant_acceleration(
     *,
     sensors: Sensor | Sequence[Sensor],
-    q: Any = 0.0,
+    q: Parameter = 0.0,
     dims: int = 1,
     noise: Literal["white", "discrete"] = "white",
-    b: Any = None,
+    b: Parameter = None,
 ) -> Model:
     """Nearly constant acceleration; arguments as in `constant_velocity`, one derivative higher
     (q is the density of white jerk in m^2/s^5, or the variance of a constant jerk)."""
@@ -74,7 +75,7 @@ def constant_acceleration(
 def _kinematic(
     order: int,
     sensors: Sensor | Sequence[Sensor],
-    q: Any,
+    q: Parameter,
     dims: int,
     noise: str,
     b: Callable[..., Array] | None,
@@ -88,14 +89,14 @@ def _kinematic(
     check_seen = domain.check_covariances(None, cov)
     motion, spread, F_where = _matrices(order, dims, noise)
 
-    def F(params: Any, t0: Array, t1: Array) -> Array:
+    def F(params: Params, t0: Array, t1: Array) -> Array:
         del params
         return motion(_interval(t0, t1))
 
-    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+    def process_cov(params: Params, t0: Array, t1: Array) -> Array:
         return domain.scaled(domain.variance("q", q, params), spread(_interval(t0, t1)))
 
-    def check(params: Any, t0: Any, t1: Any, sensors: Any) -> None:
+    def check(params: Params, t0: Numbers, t1: Numbers, sensors: Numbers) -> None:
         if t1 > t0:
             domain.check_variance("q", resolve(q, params))
         check_seen(params, t0, t1, sensors)
@@ -118,7 +119,7 @@ def _kinematic(
     )
 
 
-def _interval(t0: Any, t1: Any) -> Array:
+def _interval(t0: Numbers, t1: Numbers) -> Array:
     dt = jnp.asarray(t1) - t0
     return dt.astype(jnp.result_type(dt, 0.0))
 

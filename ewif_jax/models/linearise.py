@@ -1,8 +1,6 @@
 """What a filter asks of a model: where the state will be and what a sensor will say, with the
 derivatives of both."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -12,10 +10,11 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern
 from ewif_jax.models.model import Linear, Model, affine
 from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.types import DTypeLike, Numbers, Params
 
 
 def predict_state(
-    model: Model, params: Any, x: Array, t0: Array, t1: Array
+    model: Model, params: Params, x: Array, t0: Array, t1: Array
 ) -> tuple[Array, Array, Array]:
     """x at t1 (n,), the Jacobian F (n, n) of the motion at x, and Q (n, n) for t1 >= t0."""
     Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
@@ -34,7 +33,7 @@ def predict_state(
 
 
 def predict_measurement(
-    model: Model, params: Any, x: Array, sensor: Array, t: Array
+    model: Model, params: Params, x: Array, sensor: Array, t: Array
 ) -> tuple[Array, Array, Array]:
     """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
     check_sensor(model, params, x, sensor, t)
@@ -54,7 +53,7 @@ def predict_measurement(
 
 
 def affine_flow(
-    model: Model, params: Any, t0: Array, t1: Array, dtype: Any
+    model: Model, params: Params, t0: Array, t1: Array, dtype: DTypeLike
 ) -> tuple[Array, Array | None]:
     """F (n, n) and c (n,) or None of a linear model: x(t1) = F x(t0) + c, in either direction.
 
@@ -65,7 +64,7 @@ def affine_flow(
 
 
 def observation(
-    model: Model, params: Any, sensor: Array, t: Array, dtype: Any
+    model: Model, params: Params, sensor: Array, t: Array, dtype: DTypeLike
 ) -> tuple[Array, Array]:
     """H (m, n) and R (m, m) of a linear model."""
     linear = need_linear(model, "this operation")
@@ -79,7 +78,7 @@ def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:
     return (None, None) if model.linear is None else (model.linear.F_where, model.linear.H_where)
 
 
-def size(model: Model, params: Any, t0: Any) -> int:
+def size(model: Model, params: Params, t0: Numbers) -> int:
     """n, read off a linear model without computing anything."""
     linear = need_linear(model, "prior=None")
     return jax.eval_shape(lambda: jnp.asarray(linear.F(params, t0, t0))).shape[0]

@@ -1,7 +1,7 @@
 """The model of the world that every filter shares, linear or not."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from ewif_jax.models.discrete import constant, is_discrete, motion, pattern_of_p
 from ewif_jax.models.parameters import named, resolve
 from ewif_jax.models.tables import by_sensor, count_sensors, pattern_of_table
 from ewif_jax.recipe import FromRecipe, from_recipe
-from ewif_jax.types import Steps
+from ewif_jax.types import DTypeLike, Parameter, Params, Steps
 
 __all__ = ["Linear", "Model", "affine", "affine_motion", "linear_model", "resolve", "subtract"]
 
@@ -76,11 +76,11 @@ class Model(FromRecipe, _Model):
 
 @from_recipe
 def linear_model(
-    F: Any,
-    H: Any,
-    R: Any,
-    Q: Any = None,
-    b: Any = None,
+    F: Parameter,
+    H: Parameter,
+    R: Parameter,
+    Q: Parameter = None,
+    b: Parameter = None,
     *,
     dt: float = 1.0,
     max_steps: int = 1023,
@@ -139,17 +139,17 @@ def linear_model(
     sensors = count_sensors(rows, cols)
     moved = motion(F, Q, b, steps)
 
-    def process_cov(params: Any, t0: Array, t1: Array) -> Array:
+    def process_cov(params: Params, t0: Array, t1: Array) -> Array:
         if moved.Q is None:
             size = jax.eval_shape(lambda: jnp.asarray(moved.F(params, t0, t1))).shape[0]
             return jnp.zeros((size, size))
         found = jnp.asarray(moved.Q(params, t0, t1))
         return domain.covariance("Q", found) if callable(Q) else found
 
-    def observe(params: Any, x: Array, sensor: Array, t: Array) -> Array:
+    def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:
         return matvec(jnp.asarray(H(params, sensor, t), x.dtype), x)
 
-    def measurement_cov(params: Any, sensor: Array, t: Array) -> Array:
+    def measurement_cov(params: Params, sensor: Array, t: Array) -> Array:
         found = jnp.asarray(R(params, sensor, t))
         return domain.covariance("R", found) if R_varies else found
 
@@ -171,10 +171,10 @@ def linear_model(
     )
 
 
-def affine_motion(F: Any, b: Any) -> Callable[..., Array]:
+def affine_motion(F: Parameter, b: Parameter) -> Callable[..., Array]:
     """The transition (params, x, t0, t1) -> (n,) of x(t1) = F x(t0) + b, in either direction."""
 
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
+    def transition(params: Params, x: Array, t0: Array, t1: Array) -> Array:
         matrix, offset = affine(F, b, params, t0, t1, x.dtype)
         moved = matvec(matrix, x)
         return moved if offset is None else moved + offset
@@ -183,7 +183,7 @@ def affine_motion(F: Any, b: Any) -> Callable[..., Array]:
 
 
 def affine(
-    F: Any, b: Any, params: Any, t0: Array, t1: Array, dtype: Any
+    F: Parameter, b: Parameter, params: Params, t0: Array, t1: Array, dtype: DTypeLike
 ) -> tuple[Array, Array | None]:
     """F (n, n) and c (n,) or None of x(t1) = F x(t0) + c, in either direction."""
     matrix = jnp.asarray(F(params, t0, t1), dtype)

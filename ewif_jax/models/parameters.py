@@ -8,19 +8,21 @@ from typing import Any
 
 import jax
 
+from ewif_jax.types import Numbers, Params
 
-def resolve(value: Any, params: Any) -> Any:
+
+def resolve(value: Numbers, params: Params) -> Any:
     """`value(params)` if it is a function of the parameters, else `value`."""
     return named(value)(params) if callable(value) else value
 
 
-def named(value: Any) -> Any:
+def named(value: Numbers) -> Any:
     """A function of (params, ...) that says which name it asked for and `params` has not; anything
     else as it is."""
     return _named(value) if callable(value) else value
 
 
-def of_params(value: Any) -> bool:
+def of_params(value: Numbers) -> bool:
     """Whether it is a function of `params` alone."""
     if isinstance(value, itemgetter | attrgetter):
         return True
@@ -38,7 +40,7 @@ def of_params(value: Any) -> bool:
 
 def _named(value: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(value)
-    def call(params: Any, *args: Any) -> Any:
+    def call(params: Params, *args: Any) -> Any:
         try:
             return value(params, *args)
         except KeyError as error:
@@ -56,10 +58,10 @@ def _named(value: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _name(value: Any) -> str:
+def _name(value: Numbers) -> str:
     return getattr(value, "__name__", "a function").replace("<lambda>", "a lambda of the model")
 
 
-def _names(params: Any) -> str:
+def _names(params: Params) -> str:
     paths = [path for path, _ in jax.tree.leaves_with_path(params)]
     return ", ".join(jax.tree_util.keystr(path) for path in paths) or "nothing"

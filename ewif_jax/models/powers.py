@@ -17,7 +17,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.types import Steps
+from ewif_jax.types import Parameter, Steps
 
 BITS = 5
 """Of k, which one table looks up: few, or the tables of large matrices would be too big."""
@@ -66,7 +66,7 @@ def _row(table: Array, number: Any) -> Array:
     return lax.dynamic_index_in_dim(table, number, keepdims=False)
 
 
-def squares_of(F: Any, steps: Steps) -> np.ndarray | None:
+def squares_of(F: Parameter, steps: Steps) -> np.ndarray | None:
     """What F becomes over 1, 2, 4, ... steps, stacked, if it is an array; in float64."""
     if not isinstance(F, np.ndarray):
         return None

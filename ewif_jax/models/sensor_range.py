@@ -18,10 +18,10 @@ from ewif_jax import checks
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.models.model import Model
 from ewif_jax.recipe import digest
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers, Params
 
 
-def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None:
+def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: Any) -> None:
     """Refuses a known index that the model has no sensor for, or that it clamps where it looks
     something up; a linear model does not need to know the state x."""
     index = checks.known(sensor)
@@ -37,7 +37,7 @@ def check_sensor(model: Model, params: Any, x: Any, sensor: Any, t: Any) -> None
         )
 
 
-def check_sensors(model: Model, params: Any, x: Any, measurements: Measurement) -> None:
+def check_sensors(model: Model, params: Params, x: Numbers, measurements: Measurement) -> None:
     """`check_sensor` of the largest known index of a whole stream."""
     checks.sensors(measurements, model.sensors)
     indices = checks.known(measurements.sensor)
@@ -61,7 +61,7 @@ def _inside(model: Model, index: int, inputs: tuple) -> bool:
     return remembered(question, looks_inside)
 
 
-def _size_or_index(x: Any) -> Any:
+def _size_or_index(x: Numbers) -> Any:
     aval = jax.typeof(x)
     integer = jnp.issubdtype(aval.dtype, jnp.integer) or aval.dtype == bool
     known = checks.known(x) if integer else None
@@ -75,7 +75,7 @@ def _clamps(model: Model, index: int, inputs: tuple) -> bool:
     """
     linear = model.linear
 
-    def seen(sensor: Any, params: Any, x: Any, t: Any) -> tuple[Any, Any]:
+    def seen(sensor: Numbers, params: Params, x: Numbers, t: Any) -> tuple[Any, Any]:
         R = model.measurement_cov(params, sensor, t)
         if linear is None:
             return model.observe(params, x, sensor, t), R
@@ -89,6 +89,6 @@ def _clamps(model: Model, index: int, inputs: tuple) -> bool:
     return jax.tree.unflatten(jax.tree.structure(shape), error).get() is not None
 
 
-def _example(x: Any) -> Any:
+def _example(x: Numbers) -> Any:
     """`x` itself, or ones where its value is not known yet."""
     return np.ones(x.shape, x.dtype) if isinstance(x, Tracer) else x

@@ -1,7 +1,7 @@
 """What sensors see. Every kinematic state begins with the position, so a sensor fits any."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,7 @@ from ewif_jax.models import domain
 from ewif_jax.models.parameters import resolve
 from ewif_jax.models.tables import select
 from ewif_jax.recipe import FromRecipe, from_recipe
+from ewif_jax.types import Parameter, Params
 
 
 class _Sensor(NamedTuple):
@@ -29,7 +30,7 @@ class Sensor(FromRecipe, _Sensor):
 
 
 @from_recipe
-def position_sensor(r: Any, dims: int = 1) -> Sensor:
+def position_sensor(r: Parameter, dims: int = 1) -> Sensor:
     """A sensor of the first `dims` state components (the position).
 
     Args:
@@ -38,14 +39,14 @@ def position_sensor(r: Any, dims: int = 1) -> Sensor:
     """
     checks.whole("dims", dims, 1)
 
-    def observe(params: Any, x: Array, t: Array) -> Array:
+    def observe(params: Params, x: Array, t: Array) -> Array:
         return x[:dims]
 
     return Sensor(observe, _covariance(r, dims), (False,) * dims, lambda n: np.eye(dims, n))
 
 
 @from_recipe
-def bearing_sensor(r: Any, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
+def bearing_sensor(r: Parameter, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
     r"""A sensor of the direction to the target, :math:`\mathrm{atan2}(y - y_s, x - x_s)`, radians.
 
     Args:
@@ -58,7 +59,7 @@ def bearing_sensor(r: Any, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
     checks.shape("position", position, (2,))
     checks.finite("position", position)
 
-    def observe(params: Any, x: Array, t: Array) -> Array:
+    def observe(params: Params, x: Array, t: Array) -> Array:
         east, north = x[0] - position[0], x[1] - position[1]
         here = (east == 0) & (north == 0)
         return jnp.arctan2(jnp.where(here, 0, north), jnp.where(here, 1, east))[None]
@@ -73,7 +74,7 @@ def wrap_angle(angle: Array) -> Array:
     return jnp.where(jnp.abs(wrapped) <= 4, wrapped, jnp.nan)
 
 
-def _covariance(r: Any, m: int) -> Callable[..., Array]:
+def _covariance(r: Parameter, m: int) -> Callable[..., Array]:
     if not callable(r):
         if np.ndim(r) == 2:
             checks.psd("r", r)
@@ -81,7 +82,7 @@ def _covariance(r: Any, m: int) -> Callable[..., Array]:
         else:
             domain.check_variance("r", r)
 
-    def cov(params: Any, t: Array) -> Array:
+    def cov(params: Params, t: Array) -> Array:
         value = resolve(r, params)
         if np.ndim(value) == 2:
             checks.shape("r", value, (m, m))
@@ -109,10 +110,10 @@ def bank(
     def choose(values: list[Array], index: Array) -> Array:
         return values[0] if len(values) == 1 else select(jnp.stack(values), index)
 
-    def observe(params: Any, x: Array, sensor: Array, t: Array) -> Array:
+    def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:
         return choose([s.observe(params, x, t) for s in group], sensor)
 
-    def cov(params: Any, sensor: Array, t: Array) -> Array:
+    def cov(params: Params, sensor: Array, t: Array) -> Array:
         return choose([s.cov(params, t) for s in group], sensor)
 
     def residual(value: Array, predicted: Array, sensor: Array) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.types import Steps
+from ewif_jax.types import DTypeLike, Numbers, Steps
 
 SHARE = 0.01
 """How far from a whole step a stamp may be, in steps."""
@@ -15,7 +15,7 @@ ROUNDINGS = 4
 """How far it may be in roundings of the times: each of two stamps and their difference have one."""
 
 
-def count_steps(steps: Steps, t0: Any, t1: Any) -> tuple[Any, Any]:
+def count_steps(steps: Steps, t0: Numbers, t1: Numbers) -> tuple[Any, Any]:
     """The steps from t0 to t1 (int32, negative against time; 0 where they are not whole), and
     whether they are whole."""
     dtype = jnp.result_type(t0, t1)
@@ -40,16 +40,16 @@ def count_steps(steps: Steps, t0: Any, t1: Any) -> tuple[Any, Any]:
     return xp.where(whole, number, 0).astype(jnp.int32), whole
 
 
-def whole_steps(steps: Steps, t0: Any, t1: Any) -> Array:
+def whole_steps(steps: Steps, t0: Numbers, t1: Numbers) -> Array:
     """Whether the model can be asked to go from t0 to t1."""
     return count_steps(steps, t0, t1)[1]
 
 
 def check_steps(
     steps: Steps | None,
-    times: Any,
-    t0: Any,
-    dtype: Any,
+    times: Numbers,
+    t0: Numbers,
+    dtype: DTypeLike,
     argument: str = "measurements.time",
     in_order: bool = True,
 ) -> None:
@@ -97,7 +97,7 @@ def check_steps(
         )
 
 
-def check_interval(steps: Steps | None, argument: str, interval: Any) -> None:
+def check_interval(steps: Steps | None, argument: str, interval: Numbers) -> None:
     """Refuses a known interval () that is not whole steps of a discrete model."""
     seconds = checks.known(interval)
     if steps is None or seconds is None:

@@ -13,9 +13,10 @@ from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
+from ewif_jax.types import Numbers, Parameter, Params
 
 
-def by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
+def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
     """A function of (params, sensor, t), and how many sensors it knows of: S of a table, 0 for a
     matrix that all sensors share, None for a function."""
     if isinstance(x, Tracer):
@@ -35,7 +36,7 @@ def by_sensor(argument: str, x: Any) -> tuple[Any, int | None]:
     return (lambda params, sensor, t: select(table, sensor)), table.shape[0]
 
 
-def _looked_up(argument: str, x: Any, params: Any, sensor: Array, t: Array) -> Array:
+def _looked_up(argument: str, x: Numbers, params: Params, sensor: Array, t: Array) -> Array:
     """The matrix of a sensor in what `params` give: a matrix, or a table of them."""
     del t
     table = jnp.asarray(x(params))
@@ -54,7 +55,7 @@ def count_sensors(rows: int | None, cols: int | None) -> int | None:
     return tables[0] if tables else 1 if rows == cols == 0 else None
 
 
-def pattern_of_table(H: Any) -> Pattern | None:
+def pattern_of_table(H: Parameter) -> Pattern | None:
     """Where a constant matrix, or any of a table, may differ from zero."""
     known = None if callable(H) else checks.known(H)
     return None if known is None else pattern(*known.reshape(-1, *known.shape[-2:]))

@@ -11,7 +11,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.models.linearise import predict_measurement, predict_state
 from ewif_jax.models.model import Model
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import DTypeLike, Gaussian, Measurement, Numbers, Params
 
 LIMIT = 0.1
 """The share of a variance that may be rounding. In 12 rows of a constant velocity seen through 0.1
@@ -19,7 +19,7 @@ m, 90 runs in float32: 0.07 (a prior 1e6 times R) is off by 0.005 sigma at most,
 6 (1e8) by 0.8 and has negative variances."""
 
 
-def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Any) -> Any:
+def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Numbers) -> Any:
     """Times and sensors of the first measurements that come in sequence, which tell whether a prior
     is too wide; None where something of it is traced."""
     given = prior, t0, measurements.time, measurements.sensor, measurements.mask
@@ -34,7 +34,7 @@ def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Any) -> An
 
 
 def check_prior_width(
-    model: Model, params: Any, prior: Gaussian, t0: Any, rows: Any, dtype: Any
+    model: Model, params: Params, prior: Gaussian, t0: Numbers, rows: Any, dtype: DTypeLike
 ) -> bool:
     """True, unless a known prior is so wide that the first updates (`first_rows`) leave variances
     that are mostly what a covariance in `dtype` was rounded by: that is refused."""
@@ -69,7 +69,7 @@ def check_prior_width(
 
 @partial(jax.jit, static_argnames="model")
 def _matrices(
-    model: Model, params: Any, mean: Array, start: Array, end: Array, sensors: Array
+    model: Model, params: Params, mean: Array, start: Array, end: Array, sensors: Array
 ) -> tuple[Array, ...]:
     """F, Q, H and R of each interval and the measurement after it, along the predicted mean."""
 

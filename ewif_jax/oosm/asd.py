@@ -1,6 +1,6 @@
 """Exact use of late measurements at constant cost: what the last ones did is kept and corrected."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from ewif_jax.models import Model, patterns, predict_state
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, info_of, sound
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
 
 
 class WindowState(NamedTuple):
@@ -80,7 +80,7 @@ def asd(model: Model, lag: int) -> Estimator:
     checks.require(isinstance(model, Model), "model", "a Model", type(model).__name__)
     count = checks.whole("lag", lag, 1) + 1
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> WindowState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> WindowState:
         del key
         mean, cov = prior.mean, symmetric.pack(prior.cov)
         still = jnp.eye(mean.shape[0], dtype=mean.dtype)
@@ -90,17 +90,17 @@ def asd(model: Model, lag: int) -> Estimator:
         first = window.Kept(t0, mean, cov, still, none, one, none.T, one, none[:, 0])
         return WindowState(t0, mean, cov, still, copies(first, count))
 
-    def move(params: Any, state: WindowState, time: Array) -> WindowState:
+    def move(params: Params, state: WindowState, time: Array) -> WindowState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         cov = symmetric.congruence(F, state.cov, patterns(model)[0]) + symmetric.pack(Q)
         return state._replace(time=time, mean=mean, cov=cov, F=matmul(F, state.F))
 
-    def is_after_oldest(params: Any, state: WindowState, time: Array) -> Array:
+    def is_after_oldest(params: Params, state: WindowState, time: Array) -> Array:
         del params
         return time >= state.kept.time[0]
 
     def measure(
-        params: Any, state: WindowState, measurement: Measurement
+        params: Params, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
         place = jnp.sum(state.kept.time <= measurement.time)
         mean, cov, before, after = _split(model, params, state, measurement.time, place)
@@ -136,7 +136,7 @@ def asd(model: Model, lag: int) -> Estimator:
         )
         return updated, info_of(whole, mask, accepted)
 
-    def estimate(params: Any, state: WindowState) -> Gaussian:
+    def estimate(params: Params, state: WindowState) -> Gaussian:
         del params
         return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
@@ -147,7 +147,7 @@ def asd(model: Model, lag: int) -> Estimator:
 
 
 def _split(
-    model: Model, params: Any, state: WindowState, time: Array, place: Array
+    model: Model, params: Params, state: WindowState, time: Array, place: Array
 ) -> tuple[Array, Array, Array, Array]:
     """The filter's estimate at `time` with what is kept until then, mean (n,) and cov (packed), F
     (n, n) to there from the newest of that, and from there to what comes next."""

@@ -5,7 +5,7 @@ from typing import Any
 from ewif_jax import checks
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import offered
-from ewif_jax.types import Estimator, Info, Measurement
+from ewif_jax.types import Estimator, Info, Measurement, Params, State
 
 
 @from_recipe
@@ -28,7 +28,7 @@ def drop_late(estimator: Estimator) -> Estimator:
 
     init, predict, take, estimate = estimator[:4]
 
-    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+    def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         in_sequence = measurement.time >= state.time
         return offered(take, params, state, measurement, in_sequence)
 

@@ -1,13 +1,11 @@
 """EnKF1: late measurements through stored ensembles."""
 
-from typing import Any
-
 from jax import Array
 
 from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, Params
 
 
 @from_recipe
@@ -48,7 +46,7 @@ def enkf1(model: Model, members: int, lag: int) -> Estimator:
     """
 
     def retrodict(
-        params: Any, state: EnsembleHistory, bracket: Bracket, time: Array, key: Array
+        params: Params, state: EnsembleHistory, bracket: Bracket, time: Array, key: Array
     ) -> Array:
         return bracket.there
 

@@ -1,6 +1,6 @@
 """EnKF2: late measurements through stored ensembles, stepped back from now at once."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 from jax import Array
@@ -10,7 +10,7 @@ from ewif_jax.models import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, Params
 
 NOISES = ("fresh", "shared")
 
@@ -55,7 +55,7 @@ def enkf2(
     checks.require(noise in NOISES, "noise", f"one of {NOISES}", repr(noise))
 
     def retrodict(
-        params: Any, state: EnsembleHistory, bracket: Bracket, time: Array, key: Array
+        params: Params, state: EnsembleHistory, bracket: Bracket, time: Array, key: Array
     ) -> Array:
         there, ahead, now = bracket.there, bracket.ahead, state.members
         if ahead is None:

@@ -1,6 +1,6 @@
 """Particles that remember their paths, so that a late state is drawn between two known ones."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params
 
 
 class PathState(NamedTuple):
@@ -88,13 +88,13 @@ def pf_extended(
 
     in_order = jnp.arange(kind.particles, dtype=jnp.int32)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> PathState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> PathState:
         del params
         first = form.drawn(kind, prior, t0, key)
         times, past = copies((first.time, first.particles), lag)
         return PathState(*first, jnp.asarray(False), times, past)
 
-    def move(params: Any, state: PathState, time: Array) -> PathState:
+    def move(params: Params, state: PathState, time: Array) -> PathState:
         def go(old: PathState) -> PathState:
             paths = jnp.concatenate([old.particles[None], old.past])
             new, paths = form.step_ahead(kind, params, old, time, paths)
@@ -105,11 +105,13 @@ def pf_extended(
 
         return form.if_later(state, time, go)
 
-    def within_lag(params: Any, state: PathState, time: Array) -> Array:
+    def within_lag(params: Params, state: PathState, time: Array) -> Array:
         del params
         return time >= state.past_times[-1]
 
-    def measure(params: Any, state: PathState, measurement: Measurement) -> tuple[PathState, Info]:
+    def measure(
+        params: Params, state: PathState, measurement: Measurement
+    ) -> tuple[PathState, Info]:
         def drawn_between(cloud: ParticleState) -> tuple[ParticleState, Array, Array]:
             cloud, order, key = form.ready_to_draw(kind, cloud, in_order)
             ends = state._replace(particles=cloud.particles)
@@ -136,7 +138,7 @@ def pf_extended(
 
 
 def _between(
-    model: Model, params: Any, state: PathState, order: Array, time: Array, key: Array
+    model: Model, params: Params, state: PathState, order: Array, time: Array, key: Array
 ) -> Array:
     """Draws of the states at `time` (n, N), given where each particle was before and after: those
     now are copies, in this `order` (N,), of those that the stored paths belong to."""

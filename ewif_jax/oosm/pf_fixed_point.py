@@ -1,6 +1,6 @@
 """A particle filter that needs no old particles: auxiliary fixed-point smoothers."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from ewif_jax.recursions.innovations import numbers
 from ewif_jax.recursions.particle_smoother import lines, look_back
 from ewif_jax.recursions.sigma_points import SigmaPoints, transform
 from ewif_jax.recursions.weighing import Seen
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params
 
 Smoother = Literal["eks", "uks", "ps"]
 
@@ -51,9 +51,9 @@ def pf_fixed_point(
     resampling: Resampling = "systematic",
     ess_threshold: float = 0.5,
     collapse: float | None = 100.0,
-    ut_alpha: Any = 1.0,
-    ut_beta: Any = 0.0,
-    ut_kappa: Any = 0.0,
+    ut_alpha: Parameter = 1.0,
+    ut_beta: Parameter = 0.0,
+    ut_kappa: Parameter = 0.0,
 ) -> Estimator:
     r"""The bootstrap filter that smooths back to a late measurement from means and covariances.
 
@@ -112,7 +112,7 @@ def pf_fixed_point(
     few = checks.whole("smoother_particles", few, 2)
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if smoother == "uks" else None
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> SummaryState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> SummaryState:
         first = form.drawn(kind, prior, t0, key)
         if points is not None:
             transform(points, params, 2 * prior.mean.shape[0], t0.dtype)
@@ -124,12 +124,12 @@ def pf_fixed_point(
         past, measured = copies((told, nothing), slots)
         return SummaryState(*first, past, measured)
 
-    def within_lag(params: Any, state: SummaryState, time: Array) -> Array:
+    def within_lag(params: Params, state: SummaryState, time: Array) -> Array:
         del params
         return time >= state.past.time[-1]
 
     def measure(
-        params: Any, state: SummaryState, measurement: Measurement
+        params: Params, state: SummaryState, measurement: Measurement
     ) -> tuple[SummaryState, Info]:
         def in_sequence(state: SummaryState) -> tuple[Seen, Array]:
             weights = state.log_weights
@@ -157,14 +157,14 @@ def pf_fixed_point(
     return estimator_from(recursion._replace(model=model))
 
 
-def _size(model: Model, params: Any, at: CovarianceState) -> int:
+def _size(model: Model, params: Params, at: CovarianceState) -> int:
     """How many components a measurement has."""
     sensor = jnp.zeros((), jnp.int32)
     return jax.eval_shape(lambda: model.observe(params, at.mean, sensor, at.time)).shape[0]
 
 
 def _look_through(
-    model: Model, params: Any, past: Conditional, state: SummaryState, measurement: Measurement
+    model: Model, params: Params, past: Conditional, state: SummaryState, measurement: Measurement
 ) -> Seen:
     """A late measurement as it is seen by particles now, through the state at its time."""
     time, value, sensor, mask = measurement

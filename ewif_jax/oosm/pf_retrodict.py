@@ -1,7 +1,5 @@
 """Particles moved back to the time of a late measurement."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -12,7 +10,7 @@ from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.particles import ParticleState
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params
 
 
 @from_recipe
@@ -61,16 +59,16 @@ def pf_retrodict(
     kind = form.cloud(model, particles, resampling, ess_threshold)
     collapse = form.collapse_factor(collapse)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
         return form.drawn(kind, prior, t0, key)
 
-    def any_age(params: Any, state: ParticleState, time: Array) -> Array:
+    def any_age(params: Params, state: ParticleState, time: Array) -> Array:
         del params, state, time
         return jnp.asarray(True)
 
     def measure(
-        params: Any, state: ParticleState, measurement: Measurement
+        params: Params, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
         def moved_back(state: ParticleState) -> tuple[ParticleState, Array]:
             state, _, key = form.ready_to_draw(kind, state)

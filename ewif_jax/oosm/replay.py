@@ -12,7 +12,7 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.partial_use import partly
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Numbers, Params, RandomKey
 
 
 class ReplayState(NamedTuple):
@@ -59,7 +59,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     lag = checks.whole("lag", lag, 1)
     width = checks.whole("width", width, 1)
 
-    def start(params: Any, prior: Gaussian | None, t0: Any, key: Any) -> ReplayState:
+    def start(params: Params, prior: Gaussian | None, t0: Numbers, key: RandomKey) -> ReplayState:
         first = estimator.init(params, prior, t0, key)
         time = first.time
         nothing = Measurement(
@@ -70,16 +70,16 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         )
         return ReplayState(time, first, first, nothing, jnp.zeros((), time.dtype))
 
-    def move(params: Any, state: ReplayState, time: Array) -> ReplayState:
+    def move(params: Params, state: ReplayState, time: Array) -> ReplayState:
         current = estimator.predict(params, state.current, time)
         return state._replace(time=current.time, current=current)
 
-    def is_after_base(params: Any, state: ReplayState, time: Array) -> Array:
+    def is_after_base(params: Params, state: ReplayState, time: Array) -> Array:
         del params
         return time >= state.base.time
 
     def measure(
-        params: Any, state: ReplayState, measurement: Measurement
+        params: Params, state: ReplayState, measurement: Measurement
     ) -> tuple[ReplayState, Info]:
         size = jnp.shape(measurement.value)[0]
         checks.require(size <= width, "width", f"room for {size} components", width)
@@ -110,7 +110,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         shares = None if stored is None else jnp.append(stored, jnp.ones_like(stored[:1]))
         return ReplayState(state.time, current, base, buffer, evidence, shares), info
 
-    def estimate(params: Any, state: ReplayState) -> Gaussian:
+    def estimate(params: Params, state: ReplayState) -> Gaussian:
         return estimator.estimate(params, state.current)
 
     method = Recursion(

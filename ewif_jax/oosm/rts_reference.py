@@ -1,6 +1,6 @@
 """The smoother as a reference for late measurements: back through every stored time."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -13,7 +13,7 @@ from ewif_jax.oosm.parts.history import HistoryState, one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared, compared
-from ewif_jax.types import Estimator, Measurement
+from ewif_jax.types import Estimator, Measurement, Params
 
 
 class Tie(NamedTuple):
@@ -67,7 +67,11 @@ def rts_reference(model: Model, lag: int) -> Estimator:
 
 
 def smoothed_back(
-    model: Model, params: Any, state: HistoryState, start: CovarianceState, measurement: Measurement
+    model: Model,
+    params: Params,
+    state: HistoryState,
+    start: CovarianceState,
+    measurement: Measurement,
 ) -> tuple[Compared, bool]:
     """The measurement through the smoothed state of its time; it can always be used."""
     time = jnp.clip(measurement.time, start.time, state.time)
@@ -78,7 +82,7 @@ def smoothed_back(
 
 
 def _tied(
-    model: Model, params: Any, state: HistoryState, start: CovarianceState, time: Array
+    model: Model, params: Params, state: HistoryState, start: CovarianceState, time: Array
 ) -> Tie:
     """The state at `time`, between `start` and now, tied to the present one."""
 
@@ -94,7 +98,7 @@ def _tied(
     return choose(time < nearest.time, tie, nearest)
 
 
-def _behind(model: Model, params: Any, tie: Tie, slot: CovarianceState) -> Tie:
+def _behind(model: Model, params: Params, tie: Tie, slot: CovarianceState) -> Tie:
     """One smoothing step from `tie` to the estimate `slot` of an earlier time."""
     end = jnp.maximum(tie.time, slot.time)
     predicted, F, Q = predict_state(model, params, slot.mean, slot.time, end)

@@ -10,11 +10,21 @@ from ewif_jax.models import resolve
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import offered
 from ewif_jax.recursions.partial_use import partly, prepared
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import (
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Parameter,
+    Params,
+    RandomKey,
+    State,
+)
 
 
 @from_recipe
-def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Estimator:
+def selective(estimator: Estimator, max_delay: Parameter, softness: Parameter = None) -> Estimator:
     r"""The estimator that uses a late measurement only if it is fresh enough.
 
     .. math::
@@ -61,11 +71,11 @@ def selective(estimator: Estimator, max_delay: Any, softness: Any = None) -> Est
     if softness is not None and not callable(softness):
         checks.positive("softness", softness)
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> Any:
+    def init(params: Params, prior: Gaussian | None, t0: Numbers, key: RandomKey = None) -> Any:
         state = estimator.init(params, prior, t0, key)
         return state if softness is None else prepared(state)
 
-    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+    def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         delay = state.time - measurement.time
         limit = checks.at_least("max_delay", resolve(max_delay, params), 0.0)
         if softness is None:

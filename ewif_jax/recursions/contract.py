@@ -13,20 +13,30 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import (
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    RandomKey,
+    State,
+    Status,
+)
 
 
 class Start(Protocol):
     """The state at t0. `prior` is a checked `Gaussian` of arrays in one dtype (None only if the
     recursion `starts_from_nothing`), t0 () has that dtype."""
 
-    def __call__(self, params: Any, prior: Any, t0: Array, key: Any, /) -> Any: ...
+    def __call__(self, params: Params, prior: Any, t0: Array, key: RandomKey, /) -> Any: ...
 
 
 class Move(Protocol):
     """The state at `time`, which is not before the state's (unless the recursion `moves_back`)."""
 
-    def __call__(self, params: Any, state: Any, time: Array, /) -> Any: ...
+    def __call__(self, params: Params, state: State, time: Array, /) -> Any: ...
 
 
 class Measure(Protocol):
@@ -38,20 +48,20 @@ class Measure(Protocol):
     """
 
     def __call__(
-        self, params: Any, state: Any, measurement: Measurement, /
+        self, params: Params, state: State, measurement: Measurement, /
     ) -> tuple[Any, Info]: ...
 
 
 class Report(Protocol):
     """What is estimated of the state at its time."""
 
-    def __call__(self, params: Any, state: Any, /) -> Gaussian: ...
+    def __call__(self, params: Params, state: State, /) -> Gaussian: ...
 
 
 class Reach(Protocol):
     """Whether a measurement of this `time`, before the state's, can still be used, () bool."""
 
-    def __call__(self, params: Any, state: Any, time: Array, /) -> Array: ...
+    def __call__(self, params: Params, state: State, time: Array, /) -> Array: ...
 
 
 class Recursion(NamedTuple):
@@ -88,7 +98,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
     """The estimator of a recursion."""
     name, start, move, measure, estimate = recursion[:5]
 
-    def init(params: Any, prior: Gaussian | None, t0: Any, key: Any = None) -> Any:
+    def init(params: Params, prior: Gaussian | None, t0: Numbers, key: RandomKey = None) -> Any:
         if not recursion.starts_from_nothing:
             checks.needs_prior(prior, name)
         checks.prior(prior)
@@ -100,7 +110,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
         given = Gaussian(mean, jnp.asarray(prior.cov, mean.dtype))
         return start(params, given, jnp.asarray(t0, mean.dtype), key)
 
-    def predict(params: Any, state: Any, time: Array) -> Any:
+    def predict(params: Params, state: State, time: Array) -> Any:
         time = jnp.asarray(time, state.time.dtype)
         if recursion.moves_back:
             return move(params, state, time)
@@ -109,7 +119,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
         fields = {x: jnp.where(forwards, getattr(moved, x), jnp.nan) for x in recursion.estimated}
         return moved._replace(time=time, **fields)
 
-    def take(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+    def take(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         """A measurement within reach, or one of which nothing is present."""
         updated, info = measure(params, state, measurement)
         present, late = jnp.any(measurement.mask), measurement.time < state.time
@@ -128,7 +138,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
         info = info._replace(log_likelihood=jnp.where(present, likelihood, 0), status=status)
         return (updated if recursion.keeps else choose(present & changed, updated, state)), info
 
-    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+    def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         in_sequence = measurement.time >= state.time
         within_reach = in_sequence
         if recursion.reach is not None:
@@ -139,7 +149,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
 
 
 def offered(
-    take: Measure, params: Any, state: Any, measurement: Measurement, within_reach: Array
+    take: Measure, params: Params, state: State, measurement: Measurement, within_reach: Array
 ) -> tuple[Any, Info]:
     """`take` of a measurement that is not shown to it unless `within_reach`: `TOO_LATE` then.
 
@@ -156,7 +166,7 @@ def offered(
     return updated, info._replace(delay=state.time - measurement.time, status=status)
 
 
-def _floating(t0: Any) -> Array:
+def _floating(t0: Numbers) -> Array:
     t0 = jnp.asarray(t0)
     return t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
 

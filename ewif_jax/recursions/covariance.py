@@ -1,7 +1,7 @@
 """Covariance form: mean and covariance, moved through the model or its Jacobians."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model, patterns, predict_state
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, updated
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
 
 
 class CovarianceState(NamedTuple):
@@ -44,11 +44,11 @@ def covariance_recursion(
     keeps the covariance of a single direction a covariance.
     """
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> CovarianceState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> CovarianceState:
         del params, key
         return CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
 
-    def move(params: Any, state: CovarianceState, time: Array) -> CovarianceState:
+    def move(params: Params, state: CovarianceState, time: Array) -> CovarianceState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         cov = symmetric.congruence(F, state.cov, patterns(model)[0])
         if inflation is not None:
@@ -56,12 +56,12 @@ def covariance_recursion(
         return CovarianceState(time, mean, cov + symmetric.pack(Q))
 
     def measure_now(
-        params: Any, state: CovarianceState, measurement: Measurement
+        params: Params, state: CovarianceState, measurement: Measurement
     ) -> tuple[CovarianceState, Info]:
         mean, cov, info = measure(model, params, state.mean, state.cov, measurement)
         return CovarianceState(state.time, mean, cov), info
 
-    def estimate(params: Any, state: CovarianceState) -> Gaussian:
+    def estimate(params: Params, state: CovarianceState) -> Gaussian:
         del params
         return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
@@ -69,7 +69,7 @@ def covariance_recursion(
 
 
 def measure(
-    model: Model, params: Any, mean: Array, cov: Array, measurement: Measurement, still: int = 0
+    model: Model, params: Params, mean: Array, cov: Array, measurement: Measurement, still: int = 0
 ) -> tuple[Array, Array, Info]:
     """Mean and packed covariance after a measurement taken to be in sequence, with its `Info`
     (delay 0, status USED or REJECTED). The last `still` components of the state are not the

@@ -14,7 +14,7 @@ from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.ensembles import EnsembleState
 from ewif_jax.recursions.innovations import info_of
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params
 
 
 class Slots(NamedTuple):
@@ -62,14 +62,14 @@ def delayed(
     count = checks.whole("members", members, 2)
     lag = checks.whole("lag", lag, 1)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Array) -> EnsembleHistory:
+    def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> EnsembleHistory:
         del params
         first = ensembles.drawn(prior, t0, key, count)
         times, stored = copies((first.time, first.members), lag)
         past = Slots(times, stored, stored if forecasts else None)
         return EnsembleHistory(*first, jnp.asarray(False), past)
 
-    def move(params: Any, state: EnsembleHistory, time: Array) -> EnsembleHistory:
+    def move(params: Params, state: EnsembleHistory, time: Array) -> EnsembleHistory:
         now, noise_met = ensembles.moved(model, params, present(state), time)
         past = state.past
         if past.ahead is not None:
@@ -82,12 +82,12 @@ def delayed(
         left = EnsembleHistory(*now, jnp.asarray(False), past)
         return choose(time > state.time, left, state)
 
-    def within_lag(params: Any, state: EnsembleHistory, time: Array) -> Array:
+    def within_lag(params: Params, state: EnsembleHistory, time: Array) -> Array:
         del params
         return time >= state.past.time[-1]
 
     def measure(
-        params: Any, state: EnsembleHistory, measurement: Measurement
+        params: Params, state: EnsembleHistory, measurement: Measurement
     ) -> tuple[EnsembleHistory, Info]:
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
         then = jnp.minimum(measurement.time, state.time)
@@ -101,7 +101,7 @@ def delayed(
         info = info_of(looked.innovation, looked.mask, looked.all_finite)
         return state._replace(members=members, sight=sight, used=jnp.asarray(True)), info
 
-    def estimate(params: Any, state: EnsembleHistory) -> Gaussian:
+    def estimate(params: Params, state: EnsembleHistory) -> Gaussian:
         del params
         return ensembles.moments(state.members)
 

@@ -14,7 +14,7 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model
 from ewif_jax.recursions.innovations import numbers
 from ewif_jax.recursions.sigma_points import view
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Params
 
 
 class EnsembleState(NamedTuple):
@@ -59,7 +59,7 @@ def noise(key: Array, root: Array, count: int) -> Array:
 
 
 def process_noise(
-    model: Model, params: Any, key: Array, members: Array, t0: Array, t1: Array
+    model: Model, params: Params, key: Array, members: Array, t0: Array, t1: Array
 ) -> Array:
     """Draws (n, N) of the process noise of an interval, one for each member."""
     Q = jnp.asarray(model.process_cov(params, t0, t1), members.dtype)
@@ -67,7 +67,7 @@ def process_noise(
     return noise(key, cholesky.factor(Q).lower, members.shape[1])
 
 
-def carried(model: Model, params: Any, members: Array, t0: Array, t1: Array) -> Array:
+def carried(model: Model, params: Params, members: Array, t0: Array, t1: Array) -> Array:
     """The members (n, N) at t1, without process noise."""
 
     def move(x: Array) -> Array:
@@ -77,7 +77,7 @@ def carried(model: Model, params: Any, members: Array, t0: Array, t1: Array) -> 
 
 
 def moved(
-    model: Model, params: Any, state: EnsembleState, time: Array
+    model: Model, params: Params, state: EnsembleState, time: Array
 ) -> tuple[EnsembleState, Array]:
     """The state at a time not before its own, and the process noise (n, N) it met.
 
@@ -101,7 +101,9 @@ def back_key(sight: Array) -> Array:
     return jax.random.fold_in(sight, 2**32 - 1)
 
 
-def look(model: Model, params: Any, members: Array, there: Array, measurement: Measurement) -> Look:
+def look(
+    model: Model, params: Params, members: Array, there: Array, measurement: Measurement
+) -> Look:
     """The measurement as predicted by the members `there` (n, N) at its time; `innovation.cross`
     relates it to `members`."""
     sensor, mask = measurement.sensor, measurement.mask

@@ -1,6 +1,6 @@
 """Fixed-point smoothing: what the state now says of the state at an earlier time."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Params
 
 
 class Conditional(NamedTuple):
@@ -29,7 +29,7 @@ class Conditional(NamedTuple):
 def fixed_point(
     model: Model,
     points: SigmaPoints | None,
-    params: Any,
+    params: Params,
     start: CovarianceState,
     tau: Array,
     measurements: Measurement,

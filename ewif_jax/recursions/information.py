@@ -21,7 +21,7 @@ from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import affine_flow, observation, patterns, size
-from ewif_jax.types import Gaussian, Info, Measurement, Status
+from ewif_jax.types import Gaussian, Info, Measurement, Numbers, Params, Status
 
 
 class InformationState(NamedTuple):
@@ -41,7 +41,7 @@ class InformationState(NamedTuple):
         return symmetric.pack(T.T @ (T / self.variances[:, None]))
 
 
-def start(model: Model, params: Any, prior: Gaussian | None, t0: Any) -> InformationState:
+def start(model: Model, params: Params, prior: Gaussian | None, t0: Numbers) -> InformationState:
     """The state that knows the prior, or nothing."""
     checks.prior(prior)
     if prior is None:
@@ -60,7 +60,7 @@ def start(model: Model, params: Any, prior: Gaussian | None, t0: Any) -> Informa
 
 def transport(
     model: Model,
-    params: Any,
+    params: Params,
     state: InformationState,
     time: Array,
     growth: Array | float,
@@ -178,7 +178,7 @@ def blended(old: InformationState, new: InformationState, share: Array) -> Infor
 
 def absorb(
     model: Model,
-    params: Any,
+    params: Params,
     state: InformationState,
     measurement: Measurement,
     growth: Array | float,
@@ -207,7 +207,7 @@ def absorb(
 
 
 def contribution(
-    model: Model, params: Any, state: InformationState, measurement: Measurement
+    model: Model, params: Params, state: InformationState, measurement: Measurement
 ) -> tuple[Array, Array, Array]:
     """What one measurement says, as equations for `gathered`: whitened (m, n), targets (m,), and
     variances (m,), infinite where nothing is said."""
@@ -259,7 +259,7 @@ def _nothing(like: Array) -> dict[str, Array]:
 
 
 def _sight(
-    model: Model, params: Any, state: InformationState, measurement: Measurement
+    model: Model, params: Params, state: InformationState, measurement: Measurement
 ) -> tuple[Array, Array, Array]:
     """H A (m, n), measured minus predicted at the reference (m,), R (m, m); zeros where masked."""
     dtype = state.mean.dtype

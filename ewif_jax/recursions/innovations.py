@@ -1,6 +1,6 @@
 """Comparing a measurement with what was expected of it, and refusing what is not a number."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -10,7 +10,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import Pattern
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.models import Model, predict_measurement
-from ewif_jax.types import Info, Measurement, Status
+from ewif_jax.types import Info, Measurement, Params, Status
 
 
 class Compared(NamedTuple):
@@ -23,7 +23,7 @@ class Compared(NamedTuple):
     mask: Array
 
 
-def compared(model: Model, params: Any, mean: Array, measurement: Measurement) -> Compared:
+def compared(model: Model, params: Params, mean: Array, measurement: Measurement) -> Compared:
     """A measurement at its time as it is seen from `mean` (n,) there."""
     predicted, H, R = predict_measurement(model, params, mean, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))

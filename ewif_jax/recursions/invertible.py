@@ -1,16 +1,15 @@
 """What information forms refuse: what has no inverse."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ewif_jax import checks
 from ewif_jax.models import Model
+from ewif_jax.types import Numbers, Params
 
 
-def refuse_exact(model: Model, params: Any, t0: Any, method: str) -> None:
+def refuse_exact(model: Model, params: Params, t0: Numbers, method: str) -> None:
     """Refuses a known R that is not positive definite."""
     for sensor in range(model.sensors or 1):
         with jax.ensure_compile_time_eval():
@@ -36,7 +35,7 @@ def refuse_exact(model: Model, params: Any, t0: Any, method: str) -> None:
         )
 
 
-def refuse_one_way(model: Model, params: Any, method: str) -> None:
+def refuse_one_way(model: Model, params: Params, method: str) -> None:
     """Refuses a known F that has no inverse."""
     linear = model.linear
     if linear is None or linear.F_where is None:

@@ -14,10 +14,10 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.recursions import information
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Info, Measurement
+from ewif_jax.types import Estimator, Info, Measurement, Params, State
 
 
-def prepared(state: Any) -> Any:
+def prepared(state: State) -> Any:
     """A first state with room for the shares of the measurements that it stores, if it does."""
     if not hasattr(state, "shares"):
         return state
@@ -29,7 +29,7 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
     """The estimator that uses `share`, in [0, 1], of every measurement; its log likelihoods are
     `share` times as large. Its states are `prepared`."""
 
-    def update(params: Any, state: Any, measurement: Measurement) -> tuple[Any, Info]:
+    def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         if hasattr(state, "shares"):  # stored with the measurement, and used whenever it is
             marked = state._replace(shares=state.shares.at[-1].set(share))
             return estimator.update(params, marked, measurement)

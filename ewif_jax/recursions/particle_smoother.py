@@ -1,6 +1,6 @@
 """A small particle smoother: the state at a late time given any of many states now."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.weighing import Seen
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Params, State
 
 BLOCK = 256
 """How many particles are compared with all smoother particles at a time."""
@@ -32,7 +32,7 @@ class Lines(NamedTuple):
 
 def lines(
     model: Model,
-    params: Any,
+    params: Params,
     start: CovarianceState,
     tau: Array,
     measurements: Measurement,
@@ -75,7 +75,7 @@ def lines(
 
 
 def look_back(
-    model: Model, params: Any, last: Lines, now: Array, state: Any, measurement: Measurement
+    model: Model, params: Params, last: Lines, now: Array, state: State, measurement: Measurement
 ) -> Seen:
     r"""A late measurement as it is seen by particles now (n, N), through the lines.
 

@@ -16,7 +16,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.resampling import Resampling, ancestors, effective_sample_size
 from ewif_jax.models import Model
-from ewif_jax.types import Gaussian
+from ewif_jax.types import Gaussian, Params, State
 
 
 class ParticleState(NamedTuple):
@@ -37,7 +37,7 @@ class Cloud(NamedTuple):
     ess_threshold: float
 
 
-State = TypeVar("State", bound=Any)
+ParticleLike = TypeVar("ParticleLike", bound=Any)
 """A NamedTuple that begins with the fields of `ParticleState`."""
 
 
@@ -72,7 +72,7 @@ def noise(key: Array, cov: Array, count: int) -> Array:
 
 
 def moved(
-    model: Model, params: Any, particles: Array, key: Array, t0: Array, t1: Array
+    model: Model, params: Params, particles: Array, key: Array, t0: Array, t1: Array
 ) -> tuple[Array, Array]:
     """Particles (n, N) at t1 >= t0 without their process noise, and with it."""
     still = transported(model, params, particles, t0, t1)
@@ -81,7 +81,7 @@ def moved(
     return still, still + noise(key, Q, particles.shape[1])
 
 
-def transported(model: Model, params: Any, particles: Array, t0: Array, t1: Array) -> Array:
+def transported(model: Model, params: Params, particles: Array, t0: Array, t1: Array) -> Array:
     """Particles (n, N) moved from t0 to t1, in either direction, without noise."""
 
     def move(x: Array) -> Array:
@@ -90,23 +90,25 @@ def transported(model: Model, params: Any, particles: Array, t0: Array, t1: Arra
     return jax.vmap(move, -1, -1)(particles)
 
 
-def mover(kind: Cloud) -> Callable[[Any, State, Array], State]:
+def mover(kind: Cloud) -> Callable[[Any, ParticleLike, Array], ParticleLike]:
     """The `move` of a recursion whose particles keep nothing of their past."""
 
-    def move(params: Any, state: State, time: Array) -> State:
+    def move(params: Params, state: ParticleLike, time: Array) -> ParticleLike:
         return if_later(state, time, lambda old: step_ahead(kind, params, old, time)[0])
 
     return move
 
 
-def if_later(state: State, time: Array, go: Callable[[State], State]) -> State:
+def if_later(
+    state: ParticleLike, time: Array, go: Callable[[ParticleLike], ParticleLike]
+) -> ParticleLike:
     """`go(state)` if `time` is later than the state's, else the state, which is then not moved by
     noise of no variance: keys are used up, and weights spent, by moving only."""
     return lax.cond(time > state.time, go, lambda old: old, state)
 
 
 def step_ahead(
-    kind: Cloud, params: Any, state: Any, time: Array, along: Any = ()
+    kind: Cloud, params: Params, state: State, time: Array, along: Any = ()
 ) -> tuple[Any, Any]:
     """The state at a later `time`, and what goes along with the particles (pytrees of arrays with
     the particles as the last axis), both resampled first if too few particles count."""
@@ -116,7 +118,9 @@ def step_ahead(
     return state._replace(time=time, particles=particles, key=key), along
 
 
-def renewed(kind: Cloud, key: Array, state: State, along: Any = ()) -> tuple[State, Any]:
+def renewed(
+    kind: Cloud, key: Array, state: ParticleLike, along: Any = ()
+) -> tuple[ParticleLike, Any]:
     """The state, and what goes along with its particles, resampled if too few of them count."""
     least = kind.ess_threshold * kind.particles
     (particles, along), log_weights = refreshed(
@@ -125,7 +129,9 @@ def renewed(kind: Cloud, key: Array, state: State, along: Any = ()) -> tuple[Sta
     return state._replace(particles=particles, log_weights=log_weights), along
 
 
-def ready_to_draw(kind: Cloud, state: State, along: Any = ()) -> tuple[State, Any, Array]:
+def ready_to_draw(
+    kind: Cloud, state: ParticleLike, along: Any = ()
+) -> tuple[ParticleLike, Any, Array]:
     """The state before new noise is drawn for a late measurement, what goes along with its
     particles, and the key of that noise.
 
@@ -179,12 +185,12 @@ def moments(x: Array, weights: Array) -> tuple[Array, Array]:
     return start + shift, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
 
 
-def estimate(params: Any, state: Any) -> Gaussian:
+def estimate(params: Params, state: State) -> Gaussian:
     """The `estimate` of a recursion whose state begins with the fields of `ParticleState`."""
     del params
     return summary(state)
 
 
-def summary(state: Any) -> Gaussian:
+def summary(state: State) -> Gaussian:
     """Weighted mean (n,) and covariance (n, n) of the particles."""
     return Gaussian(*moments(state.particles, jnp.exp(state.log_weights)))

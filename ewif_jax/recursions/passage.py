@@ -16,6 +16,7 @@ from ewif_jax.kernels.growth import grown
 from ewif_jax.models.linearise import affine_flow
 from ewif_jax.models.model import Model
 from ewif_jax.recursions.information import InformationState, moved
+from ewif_jax.types import DTypeLike, Params
 
 
 class Passage(NamedTuple):
@@ -30,11 +31,11 @@ class Passage(NamedTuple):
 
 def passage(
     model: Model,
-    params: Any,
+    params: Params,
     growing: Callable[[Any, Array, Array], Array],
     t0: Array,
     t1: Array,
-    dtype: Any,
+    dtype: DTypeLike,
 ) -> Passage:
     """The passage from t0 to t1; growing(params, t0, t1) is the factor on the variances."""
     F, c = affine_flow(model, params, t0, t1, dtype)
@@ -43,7 +44,7 @@ def passage(
     return Passage(F, offset, back, jnp.asarray(growing(params, t0, t1), dtype))
 
 
-def standstill(n: int, dtype: Any) -> Passage:
+def standstill(n: int, dtype: DTypeLike) -> Passage:
     """The passage that changes nothing."""
     eye = jnp.eye(n, dtype=dtype)
     return Passage(eye, jnp.zeros(n, dtype), eye, jnp.ones((), dtype))

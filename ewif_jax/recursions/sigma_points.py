@@ -16,7 +16,7 @@ from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
 from ewif_jax.recursions.innovations import Compared, info_of, numbers, updated
-from ewif_jax.types import Info, Measurement
+from ewif_jax.types import DTypeLike, Info, Measurement, Params
 
 ROUNDING = 1e-4
 """The largest share of a value that the weights may turn rounding into."""
@@ -37,7 +37,7 @@ class Transform(NamedTuple):
     centre: Array
 
 
-def transform(points: SigmaPoints, params: Any, n: int, dtype: Any) -> Transform:
+def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> Transform:
     """The weights for n states; refuses settings that `dtype` cannot carry."""
     ut_alpha, ut_beta, ut_kappa = (resolve(x, params) for x in points)
     checks.positive("ut_alpha", ut_alpha)
@@ -59,7 +59,7 @@ def transform(points: SigmaPoints, params: Any, n: int, dtype: Any) -> Transform
 
 
 def view(
-    model: Model, params: Any, sensor: Array, t: Array, x: Array
+    model: Model, params: Params, sensor: Array, t: Array, x: Array
 ) -> tuple[Callable[[Array], Array], Array]:
     """What the sensor sees as a function of a state (n,), and R (m, m); refuses a bad sensor."""
     check_sensor(model, params, x, sensor, t)
@@ -70,7 +70,7 @@ def view(
 def flow_around(
     model: Model,
     points: SigmaPoints | None,
-    params: Any,
+    params: Params,
     mean: Array,
     cov: Array,
     t0: Array,
@@ -88,7 +88,7 @@ def flow_around(
 
 
 def move_around(
-    model: Model, points: SigmaPoints, params: Any, mean: Array, cov: Array, t0: Array, t1: Array
+    model: Model, points: SigmaPoints, params: Params, mean: Array, cov: Array, t0: Array, t1: Array
 ) -> tuple[Array, Array]:
     """Mean (n,) and packed covariance at t1 of a Gaussian at t0 with a packed `cov`."""
     if model.linear is not None:
@@ -103,7 +103,7 @@ def move_around(
 def measure_around(
     model: Model,
     points: SigmaPoints | None,
-    params: Any,
+    params: Params,
     mean: Array,
     cov: Array,
     measurement: Measurement,
@@ -149,7 +149,7 @@ def _fine_root(cov: Array, n: int) -> Array:
 def _moved(
     model: Model,
     points: SigmaPoints,
-    params: Any,
+    params: Params,
     mean: Array,
     lower: Array,
     t0: Array,
@@ -168,7 +168,7 @@ def _regressed(
     f: Callable[[Array], Array],
     apart: Callable[[Array, Array], Array],
     points: SigmaPoints,
-    params: Any,
+    params: Params,
     mean: Array,
     lower: Array,
     still: int,

@@ -1,6 +1,6 @@
 """What particles make of a measurement: their densities, the innovation given all, new weights."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from ewif_jax.kernels.resampling import effective_sample_size
 from ewif_jax.models import Model
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.particles import moments
-from ewif_jax.types import Info, Measurement, Status
+from ewif_jax.types import Info, Measurement, Params, State, Status
 
 
 class Seen(NamedTuple):
@@ -39,13 +39,13 @@ class Compared(NamedTuple):
     factor: cholesky.Factor
 
 
-def is_late(state: Any, measurement: Measurement) -> Array:
+def is_late(state: State, measurement: Measurement) -> Array:
     """Whether there is something to look back for, () bool: a branch not taken costs nothing."""
     return (measurement.time < state.time) & jnp.any(measurement.mask)
 
 
 def look(
-    model: Model, params: Any, particles: Array, log_weights: Array, measurement: Measurement
+    model: Model, params: Params, particles: Array, log_weights: Array, measurement: Measurement
 ) -> Seen:
     """The measurement as it is seen by particles (n, N) at its time.
 
@@ -62,7 +62,7 @@ def look(
 
 def averaged(
     model: Model,
-    params: Any,
+    params: Params,
     particles: Array,
     predicted: Array,
     numbers: Array,
@@ -78,7 +78,7 @@ def averaged(
     return innovation_of(model, origin, shift, numbers, measurement), spread
 
 
-def compared(model: Model, params: Any, particles: Array, measurement: Measurement) -> Compared:
+def compared(model: Model, params: Params, particles: Array, measurement: Measurement) -> Compared:
     """The measurement beside what particles (n, N) at its time predict."""
     time, value, sensor, mask = measurement
     check_sensor(model, params, particles[:, 0], sensor, time)
@@ -116,7 +116,7 @@ def shares(log_weights: Array, numbers: Array) -> Array:
 
 def stand_in(
     model: Model,
-    params: Any,
+    params: Params,
     numbers: Array,
     particles: Array,
     weights: Array,
@@ -160,7 +160,7 @@ def judged(cov: Array, numbers: Array) -> Array:
 
 
 def weigh(
-    state: Any, seen: Seen, measurement: Measurement, collapse: float | None = None
+    state: State, seen: Seen, measurement: Measurement, collapse: float | None = None
 ) -> tuple[Array, Info]:
     r"""Log weights :math:`\log w_i + \log p(z | x_i)`, normalised (N,), and the `Info`.
 

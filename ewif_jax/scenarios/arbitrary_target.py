@@ -1,8 +1,6 @@
 """A target that turns and speeds as it likes, seen by two sensors, one of them late: Fig. 2 of
 Shulami & Sigalov."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ from ewif_jax.models import Model, Sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, uniform_delays
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers, Parameter, Params
 
 LENGTH, SETTLED = 60.0, 5.0
 SLOW, FAST = 0.5, 0.15
@@ -21,7 +19,7 @@ PROMPT_SD, LATE_SD = (2.0, 6.0), (2.0, 6.0)
 DELAY = (0.3, 2.5)
 
 
-def arbitrary_path(time: Any) -> Array:
+def arbitrary_path(time: Numbers) -> Array:
     """Position (..., 2) in m at `time` (...) in seconds: smooth, with speeds from 4 to 10 m/s and
     turns to either side."""
     grid, east, north = _path()
@@ -29,7 +27,7 @@ def arbitrary_path(time: Any) -> Array:
     return jnp.stack([jnp.interp(time, grid, east), jnp.interp(time, grid, north)], -1)
 
 
-def arbitrary_noise(sensor: Any, time: Any) -> Array:
+def arbitrary_noise(sensor: Numbers, time: Numbers) -> Array:
     """Noise standard deviation () in m, the same on both axes: it swells and shrinks along the way,
     in opposite phase for the two sensors."""
     low, high = jnp.asarray(PROMPT_SD), jnp.asarray(LATE_SD)
@@ -39,11 +37,11 @@ def arbitrary_noise(sensor: Any, time: Any) -> Array:
 
 
 @from_recipe
-def arbitrary_target_model(q: Any = 0.0) -> Model:
+def arbitrary_target_model(q: Parameter = 0.0) -> Model:
     """Constant acceleration in two dimensions, the paper's model; sensor 0 is prompt, 1 late."""
 
     def sensor(number: int) -> Sensor:
-        def cov(params: Any, t: Array) -> Array:
+        def cov(params: Params, t: Array) -> Array:
             del params
             return jnp.square(arbitrary_noise(number, t)) * jnp.eye(2)
 

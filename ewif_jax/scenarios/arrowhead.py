@@ -11,14 +11,14 @@ from ewif_jax.models import Model, position_sensor, wrap_angle
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, exponential_delays, regular_times
-from ewif_jax.types import Gaussian
+from ewif_jax.types import Gaussian, Numbers, Parameter, Params
 
 RADIUS, SPEED = 100.0, 5.0
 EKF_Q = (0.0383, 0.0383, 0.1768, 0.0139)
 EKF_R = (2000.0, 2000.0, 4.0, 0.04)
 
 
-def arrowhead_path(time: Any) -> Array:
+def arrowhead_path(time: Numbers) -> Array:
     r"""Position (..., 2) in m at `time` (...) in seconds.
 
     .. math::
@@ -33,7 +33,7 @@ def arrowhead_path(time: Any) -> Array:
     return RADIUS * jnp.stack([east, north], -1)
 
 
-def arrowhead_state(time: Any) -> Array:
+def arrowhead_state(time: Numbers) -> Array:
     """x, y (m), speed (m/s) and heading (rad) along the path, (..., 4)."""
     time = jnp.asarray(time)
     position, velocity = jax.jvp(arrowhead_path, (time,), (jnp.ones_like(time),))
@@ -43,7 +43,7 @@ def arrowhead_state(time: Any) -> Array:
 
 
 @from_recipe
-def arrowhead_model(q: Any = 20.0, r: Any = 2000.0) -> Model:
+def arrowhead_model(q: Parameter = 20.0, r: Parameter = 2000.0) -> Model:
     """The random walk (no velocity) that follows the path in section 4.2; q in m^2/s and r in m^2,
     numbers or functions of `params`."""
     return models.random_walk(sensors=position_sensor(r, dims=2), q=q, dims=2)
@@ -63,7 +63,7 @@ def arrowhead(
 
 
 @from_recipe
-def arrowhead_ekf_model(q: Any = EKF_Q, r: Any = EKF_R) -> Model:
+def arrowhead_ekf_model(q: Parameter = EKF_Q, r: Parameter = EKF_R) -> Model:
     r"""Position, speed and heading with all four measured: the model of section 4.3.
 
     .. math::
@@ -80,7 +80,7 @@ def arrowhead_ekf_model(q: Any = EKF_Q, r: Any = EKF_R) -> Model:
     checks.psd("q", Q)
     checks.psd("r", R, definite=True)
 
-    def transition(params: Any, x: Array, t0: Array, t1: Array) -> Array:
+    def transition(params: Params, x: Array, t0: Array, t1: Array) -> Array:
         del params
         way = x[2] * (t1 - t0)
         still = jnp.zeros_like(way)
@@ -115,7 +115,7 @@ def arrowhead_ekf(
     return _delayed(arrowhead_state, r, dt, mean_delay, steps)
 
 
-def _delayed(path: Any, r: Any, dt: float, mean_delay: float, steps: int) -> Scenario:
+def _delayed(path: Any, r: Parameter, dt: float, mean_delay: float, steps: int) -> Scenario:
     start = path(jnp.asarray(0.0))
     size = start.shape[0]
 

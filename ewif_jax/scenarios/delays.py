@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks, clocks, plain
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Numbers
 
 
 class Delivery(NamedTuple):
@@ -21,7 +21,7 @@ class Delivery(NamedTuple):
     order: Array
 
 
-def regular_times(interval: Any, steps: int, start: Any = 0.0) -> Array:
+def regular_times(interval: Numbers, steps: int, start: Any = 0.0) -> Array:
     """(T,) start, start + interval, ... in seconds.
 
     Raises:
@@ -107,7 +107,13 @@ def losses(key: Array, probability: Any, steps: int) -> Array:
 
 
 def deliver(
-    time: Any, value: Any, delay: Any, *, sensor: Any = 0, lost: Any = None, mask: Any = None
+    time: Numbers,
+    value: Numbers,
+    delay: Any,
+    *,
+    sensor: Numbers = 0,
+    lost: Any = None,
+    mask: Numbers = None,
 ) -> Delivery:
     """The measurements in their order of arrival, time + delay.
 

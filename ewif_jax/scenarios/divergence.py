@@ -18,7 +18,7 @@ from ewif_jax.models import position_sensor, random_walk
 from ewif_jax.models.model import resolve
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
-from ewif_jax.types import Estimator, Gaussian, Measurement
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params
 
 Remedy = Literal["none", "noise", "weighting", "memory"]
 Push = Literal["white", "constant"]
@@ -38,7 +38,7 @@ class Growth(NamedTuple):
 
 
 def divergence_curve(
-    remedy: Remedy, push: Push, time: Any, *, eps: Any, setting: Any = None
+    remedy: Remedy, push: Push, time: Numbers, *, eps: Any, setting: Any = None
 ) -> Array:
     r"""The exact mean square error E|x - x_hat|^2 (T,) of the continuous filter.
 
@@ -92,7 +92,7 @@ def divergence_filter(remedy: Remedy, *, dt: float, setting: Any = None) -> Esti
         samples = checks.whole("setting / dt", round(setting / dt), 1)
         return limited_memory(still, (samples - 0.5) * dt, samples + 1)
 
-    def inflation(params: Any, t0: Array, t1: Array) -> Array:
+    def inflation(params: Params, t0: Array, t1: Array) -> Array:
         return jnp.exp(2 * resolve(setting, params) * (t1 - t0))
 
     return fading(still, inflation=inflation)

@@ -11,11 +11,11 @@ from ewif_jax.models import Model, position_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, exponential_delays, poisson_times
-from ewif_jax.types import Gaussian
+from ewif_jax.types import Gaussian, Parameter
 
 
 @from_recipe
-def random_walk_model(q: Any = 25.0, r: Any = 2500.0) -> Model:
+def random_walk_model(q: Parameter = 25.0, r: Parameter = 2500.0) -> Model:
     """The model that is right for `random_walk`; q in m^2/s and r in m^2, numbers or functions of
     `params`."""
     return models.random_walk(sensors=position_sensor(r), q=q)
@@ -23,7 +23,7 @@ def random_walk_model(q: Any = 25.0, r: Any = 2500.0) -> Model:
 
 @from_recipe
 def random_walk(
-    q: Any = 25.0,
+    q: Parameter = 25.0,
     r: float = 2500.0,
     mean_interval: float = 0.2,
     mean_delay: Any = 4.0,

@@ -12,7 +12,7 @@ from ewif_jax import checks, models
 from ewif_jax.models import Model, Sensor, bearing_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params
 
 PROMPT, LATE = ((-200.0, 0.0), (200.0, 0.0)), (-750.0, 750.0)
 RADIUS, SPEED, SECONDS = 500.0, 200 / 3.6, 30
@@ -22,7 +22,7 @@ Q, Q_TURN = 10.0**2, 0.1**2
 PRIOR_SD = (250.0, 250.0, 30.0, 30.0, 0.1)
 
 
-def turn_state(time: Any) -> Array:
+def turn_state(time: Numbers) -> Array:
     """The true state (..., 5) at `time` (...) in seconds: x and y in m, their velocities in m/s,
     and the turn rate in rad/s. It starts at (-500, 500) m to the north and turns clockwise."""
     time = jnp.asarray(time)
@@ -33,7 +33,7 @@ def turn_state(time: Any) -> Array:
 
 
 @from_recipe
-def turn_model(q: Any = Q, q_turn: Any = Q_TURN, r: Any = NOISE_SD**2) -> Model:
+def turn_model(q: Parameter = Q, q_turn: Any = Q_TURN, r: Parameter = NOISE_SD**2) -> Model:
     """A coordinated turn; "sensor" 0 is the pair of bearings from (-200, 0) m and (200, 0) m, and 1
     is the bearing from (-750, 750) m (its second component is always absent).
 
@@ -107,10 +107,10 @@ def turn(
 def _side_by_side(first: Sensor, second: Sensor) -> Sensor:
     """Two sensors of one component each as one sensor of two."""
 
-    def observe(params: Any, x: Array, t: Array) -> Array:
+    def observe(params: Params, x: Array, t: Array) -> Array:
         return jnp.concatenate([s.observe(params, x, t) for s in (first, second)])
 
-    def cov(params: Any, t: Array) -> Array:
+    def cov(params: Params, t: Array) -> Array:
         return jnp.diag(jnp.concatenate([jnp.diag(s.cov(params, t)) for s in (first, second)]))
 
     return Sensor(observe, cov, first.angle + second.angle)

@@ -2,7 +2,6 @@
 sections 5 and 6."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from ewif_jax import checks, models
 from ewif_jax.models import Model, bearing_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter
 
 SENSORS = ((-200.0, 0.0), (200.0, 0.0))
 PERIODS = (2.6, 2.8)
@@ -27,7 +26,7 @@ HALVINGS = 40
 
 
 @from_recipe
-def two_bearings_model(q: Any = Q, r: Any = NOISE_SD**2) -> Model:
+def two_bearings_model(q: Parameter = Q, r: Parameter = NOISE_SD**2) -> Model:
     """Constant velocity in the plane, seen by bearing sensors at (-200, 0) m and (200, 0) m.
 
     Args:
@@ -38,7 +37,7 @@ def two_bearings_model(q: Any = Q, r: Any = NOISE_SD**2) -> Model:
     return models.constant_velocity(sensors=sensors, q=q, dims=2)
 
 
-def two_bearings_path(key: Array, time: Any, q: float = Q, length: float = LENGTH) -> Array:
+def two_bearings_path(key: Array, time: Numbers, q: float = Q, length: float = LENGTH) -> Array:
     """The target's state (T, 4) at `time` (T,) in the run that `two_bearings` draws from `key`: x
     and y in m, their velocities in m/s.
 

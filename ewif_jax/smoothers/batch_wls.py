@@ -23,7 +23,7 @@ from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions.invertible import refuse_exact
 from ewif_jax.streams import cast, float_dtype, given
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Numbers, Params
 
 Weight = Callable[[Any, Array, Array], Array]
 REPORTS_AT_ONCE = 64
@@ -31,13 +31,13 @@ REPORTS_AT_ONCE = 64
 
 def batch_wls(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
-    times: Any,
+    times: Numbers,
     *,
     weight: Weight,
     prior: Gaussian | None = None,
-    t0: Any = None,
+    t0: Numbers = None,
 ) -> Gaussian:
     r"""The weighted least-squares estimate at each report time, from all the measurements.
 
@@ -98,12 +98,12 @@ def batch_wls(
 @partial(jax.jit, static_argnames=("model", "weight"))
 def _batch_wls(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     times: Array,
     weight: Weight,
     prior: Gaussian | None,
-    t0: Any,
+    t0: Numbers,
 ) -> Gaussian:
     dtype = times.dtype
 

@@ -1,6 +1,6 @@
 """Smoothing a fixed lag behind the newest measurement, as an estimator for `run` and `step`."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -14,7 +14,7 @@ from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.covariance import measure
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
 
 
 class LagState(NamedTuple):
@@ -54,12 +54,12 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
     """
     slots = checks.whole("lag", lag, 1) + 1
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> LagState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> LagState:
         del params, key
         cov = symmetric.pack(jnp.tile(prior.cov, (slots, slots)))
         return LagState(t0, jnp.full(slots, t0), jnp.tile(prior.mean, (slots, 1)), cov)
 
-    def move(params: Any, state: LagState, time: Array) -> LagState:
+    def move(params: Params, state: LagState, time: Array) -> LagState:
         n = state.mean.shape[1]
         moved, F, Q = predict_state(model, params, state.mean[0], state.time, time)
         older = symmetric.unpack(state.cov)[:-n, :-n]
@@ -76,13 +76,13 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
         return choose(time > state.time, shifted, state)
 
     def measure_newest(
-        params: Any, state: LagState, measurement: Measurement
+        params: Params, state: LagState, measurement: Measurement
     ) -> tuple[LagState, Info]:
         flat, older = state.mean.ravel(), state.mean[1:].size
         mean, cov, info = measure(model, params, flat, state.cov, measurement, older)
         return state._replace(mean=mean.reshape(state.mean.shape), cov=cov), info
 
-    def estimate(params: Any, state: LagState) -> Gaussian:
+    def estimate(params: Params, state: LagState) -> Gaussian:
         del params
         n = state.mean.shape[1]
         cov = symmetric.unpack(symmetric.no_negative(state.cov))

@@ -11,12 +11,16 @@ from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.steps import check_interval
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Gaussian
+from ewif_jax.types import Estimator, Gaussian, Parameter, Params
 
 
 @from_recipe
 def fixed_lag_ewif(
-    model: Model, tau: Any = None, *, lag: Any, weight: Callable[..., Array] | None = None
+    model: Model,
+    tau: Parameter = None,
+    *,
+    lag: Parameter,
+    weight: Callable[..., Array] | None = None,
 ) -> Estimator:
     r"""The `ewif` that reports `lag` seconds behind its own time.
 
@@ -41,14 +45,14 @@ def fixed_lag_ewif(
     if not callable(lag):
         _check_lag(model, lag)
 
-    def estimate(params: Any, state: InformationState) -> Gaussian:
+    def estimate(params: Params, state: InformationState) -> Gaussian:
         behind = _check_lag(model, resolve(lag, params))
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
     return Estimator(*filtered[:3], estimate, model=filtered.model)
 
 
-def _check_lag(model: Model, lag: Any) -> Any:
+def _check_lag(model: Model, lag: Parameter) -> Any:
     """Refuses a known lag that is negative or no interval of the model; returns it."""
     checks.shape("lag", lag, ())
     check_interval(model.steps, "lag", checks.at_least("lag", lag, 0.0))

@@ -1,7 +1,7 @@
 """The Rauch-Tung-Striebel smoother: every state given all the measurements."""
 
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around, transform
 from ewif_jax.streams import cast, float_dtype, given
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params
 
 FORMS = ("extended", "unscented")
 
@@ -35,15 +35,15 @@ class Moved(NamedTuple):
 
 def rts(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
     prior: Gaussian,
-    t0: Any,
+    t0: Numbers,
     form: Literal["extended", "unscented"] = "extended",
-    ut_alpha: Any = 1.0,
-    ut_beta: Any = 0.0,
-    ut_kappa: Any = 0.0,
+    ut_alpha: Parameter = 1.0,
+    ut_beta: Parameter = 0.0,
+    ut_kappa: Parameter = 0.0,
 ) -> Gaussian:
     r"""The state at the time of each measurement, given all the measurements.
 
@@ -111,7 +111,7 @@ def rts(
 def _rts(
     model: Model,
     points: SigmaPoints | None,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     prior: Gaussian,
     t0: Array,

@@ -1,7 +1,6 @@
 """The exponentially weighted estimate that looks both ways in time."""
 
 from functools import partial, reduce
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,18 +22,18 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
 from ewif_jax.streams import cast, float_dtype, given
-from ewif_jax.types import Gaussian, Measurement
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params
 
 
 def two_sided_ewif(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     *,
-    tau: Any,
+    tau: Parameter,
     prior: Gaussian | None = None,
-    t0: Any = None,
-    times: Any = None,
+    t0: Numbers = None,
+    times: Numbers = None,
 ) -> Gaussian:
     r"""The least-squares estimate in which a measurement s seconds away counts exp(-|s| / tau).
 
@@ -94,11 +93,11 @@ def two_sided_ewif(
 @partial(jax.jit, static_argnames="model")
 def _two_sided(
     model: Model,
-    params: Any,
+    params: Params,
     measurements: Measurement,
     tau: Array,
     prior: Gaussian | None,
-    t0: Any,
+    t0: Numbers,
     times: Array | None,
 ) -> Gaussian:
     times = measurements.time if times is None else times

@@ -11,6 +11,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.transforms import Transform, positive, psd, unconstrained
 from ewif_jax.tuning.value_gradient import Loss, value_and_gradient
+from ewif_jax.types import Numbers, Params, RandomKey, State
 
 if TYPE_CHECKING:
     import optax
@@ -28,12 +29,12 @@ class Tuned(NamedTuple):
 
 def tune(
     loss: Loss,
-    params: Any,
+    params: Params,
     *,
     steps: int = 200,
     optimizer: "optax.GradientTransformation | None" = None,
     transforms: Any = None,
-    key: Any = None,
+    key: RandomKey = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Tuned:
     """The best parameters of a gradient descent on `loss`, with the history.
@@ -77,7 +78,7 @@ def tune(
     checks.require(shape == (), "loss", "a function that returns one number ()", f"shape {shape}")
     is_transform: Callable[[Any], bool] = lambda t: isinstance(t, Transform)  # noqa: E731
 
-    def constrain(free: Any) -> Any:
+    def constrain(free: Params) -> Any:
         return jax.tree.map(lambda t, x: t.constrain(x), transforms, free, is_leaf=is_transform)
 
     free = jax.tree.map(lambda t, x: t.free(x), transforms, params, is_leaf=is_transform)
@@ -89,16 +90,16 @@ def tune(
         optimizer = optax.adam(optax.cosine_decay_schedule(0.1, steps))
     state = optimizer.init(free)
 
-    def objective(free: Any, key: Any) -> Array:
+    def objective(free: Params, key: RandomKey) -> Array:
         return loss(constrain(free)) if key is None else loss(constrain(free), key)
 
-    def evaluate(free: Any, key: Any) -> tuple[Array, Any, Array, Any]:
+    def evaluate(free: Params, key: RandomKey) -> tuple[Array, Any, Array, Any]:
         value, gradient = value_and_gradient(objective, free, key)
         finite = [jnp.all(jnp.isfinite(x)) for x in (value, *jax.tree.leaves(gradient))]
         return value, gradient, jnp.all(jnp.stack(finite)), constrain(free)
 
     @jax.jit
-    def advance(free: Any, state: Any, scale: Array, key: Any) -> tuple[Any, ...]:
+    def advance(free: Params, state: State, scale: Array, key: RandomKey) -> tuple[Any, ...]:
         """A step from `free`, whose loss and gradient are known to be used only if finite."""
         value, gradient, is_finite, params = evaluate(free, key)
         updates, moved = optimizer.update(gradient, state, free)
@@ -141,7 +142,7 @@ def tune(
     return Tuned(*best[:2], history, reason)
 
 
-def _as_float(x: Any) -> Array:
+def _as_float(x: Numbers) -> Array:
     dtype = jnp.asarray(x).dtype
     floating = jnp.issubdtype(dtype, jnp.floating)
     # Named, so that no type is weak: it would turn strong in the first step, and compile again.

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
+from ewif_jax.types import Params
+
 Loss = Callable[..., Array]
 FORWARD_UP_TO = 4
 
 
-def value_and_gradient(loss: Loss, params: Any, *rest: Any) -> tuple[Array, Any]:
+def value_and_gradient(loss: Loss, params: Params, *rest: Any) -> tuple[Array, Any]:
     """`loss(params, *rest)` and its gradient in `params`, a pytree of floats.
 
     Up to four numbers go through forward mode, which keeps no history, two of them in one pass;

@@ -12,7 +12,7 @@ from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model, patterns, predict_measurement, predict_state
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared
-from ewif_jax.types import Measurement
+from ewif_jax.types import Measurement, Params, State
 
 Equivalent = Callable[
     [Model, Any, Any, CovarianceState, Measurement], tuple[Compared, Array | bool]
@@ -22,7 +22,7 @@ whether it can be used, () bool; `start` is the last stored estimate before it."
 
 
 def noise_estimated(
-    model: Model, params: Any, state: Any, start: CovarianceState, measurement: Measurement
+    model: Model, params: Params, state: State, start: CovarianceState, measurement: Measurement
 ) -> tuple[Compared, Array | bool]:
     """The equivalent measurement with the process noise estimated, in the form that fits the model.
 
@@ -36,7 +36,7 @@ def noise_estimated(
 
 
 def tied_to_start(
-    model: Model, params: Any, state: Any, start: CovarianceState, measurement: Measurement
+    model: Model, params: Params, state: State, start: CovarianceState, measurement: Measurement
 ) -> tuple[Compared, Array | bool]:
     r"""The equivalent measurement of a linear model, without motion back in time.
 
@@ -74,8 +74,8 @@ def tied_to_start(
 
 def moved_back(
     model: Model,
-    params: Any,
-    state: Any,
+    params: Params,
+    state: State,
     start: CovarianceState,
     measurement: Measurement,
     *,

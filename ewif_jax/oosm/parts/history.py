@@ -1,6 +1,6 @@
 """What the one-step methods share: the estimates of the last update times, and the late update."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from ewif_jax.oosm.parts.equivalent import Equivalent
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.covariance import CovarianceState, covariance_recursion
 from ewif_jax.recursions.innovations import updated
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status
+from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey, Status
 
 
 class HistoryState(NamedTuple):
@@ -44,13 +44,13 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
     lag = checks.whole("lag", lag, 1)
     in_sequence = covariance_recursion(model, method)
 
-    def start(params: Any, prior: Gaussian, t0: Array, key: Any) -> HistoryState:
+    def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> HistoryState:
         first = in_sequence.init(params, prior, t0, key)
         return HistoryState(
             first.time, first.mean, first.cov, jnp.asarray(False), copies(first, lag)
         )
 
-    def move(params: Any, state: HistoryState, time: Array) -> HistoryState:
+    def move(params: Params, state: HistoryState, time: Array) -> HistoryState:
         now = CovarianceState(state.time, state.mean, state.cov)
         moved = in_sequence.move(params, now, time)
         left = time > state.time
@@ -58,12 +58,12 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
         past = jax.tree.map(lambda new, old: slots.pushed(new, old, push), now, state.past)
         return HistoryState(time, moved.mean, moved.cov, state.used & ~left, past)
 
-    def is_after_oldest(params: Any, state: HistoryState, time: Array) -> Array:
+    def is_after_oldest(params: Params, state: HistoryState, time: Array) -> Array:
         del params
         return time >= state.past.time[-1]
 
     def measure(
-        params: Any, state: HistoryState, measurement: Measurement
+        params: Params, state: HistoryState, measurement: Measurement
     ) -> tuple[HistoryState, Info]:
         _, before = last_before(state.past, measurement.time)
         seen, usable = equivalent(model, params, state, before, measurement)

@@ -25,6 +25,7 @@ from ewif_jax.study.shared.folder import Folder
 from ewif_jax.study.shared.pieces import Arrays
 from ewif_jax.study.shared.refusal import Refused, stop_if_asked
 from ewif_jax.study.shared.timing import timed
+from ewif_jax.types import Numbers
 
 __all__ = ("Experiment", "Measured", "Options", "Refused", "shown")
 
@@ -194,7 +195,7 @@ class Experiment:
             self.say(f"Unfinished work with other settings stays in {self.folder.partial.parent}.")
 
 
-def shown(value: Any) -> str:
+def shown(value: Numbers) -> str:
     """A table cell: four significant digits, an error rounded to two, nothing for None."""
     match value:
         case None:

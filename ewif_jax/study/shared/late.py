@@ -16,7 +16,7 @@ from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.scores import Score, average, scored, squared_error
 from ewif_jax.study.shared.experiment import Measured
-from ewif_jax.types import Estimator, Measurement, Status
+from ewif_jax.types import Estimator, Measurement, Numbers, Status
 
 
 def late_used(step: Step, truth: Array, mask: Array) -> Array:
@@ -155,7 +155,7 @@ def exact_late(
     source = arrival[rows, np.maximum(place, 0)]
     present = (place >= 0) & (source <= at[:, None])
 
-    def windows(x: Any) -> Array:
+    def windows(x: Numbers) -> Array:
         chosen = np.asarray(x)[rows, source]
         return array(chosen.reshape(-1, window, *chosen.shape[3:]))
 

@@ -13,7 +13,7 @@ from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.timing import timed
-from ewif_jax.types import Estimator, Measurement, Trace
+from ewif_jax.types import Estimator, Measurement, Numbers, RandomKey, Trace
 
 Observe = Callable[[Trace, Simulation], Mapping[str, Any]]
 PARTS = 5
@@ -49,7 +49,7 @@ def tracker(
     (R,): time on one core without compiling, the same for all runs of one of `PARTS` equal parts.
     """
 
-    def track(simulation: Simulation, key: Any) -> Mapping[str, Any]:
+    def track(simulation: Simulation, key: RandomKey) -> Mapping[str, Any]:
         trace = run(
             estimator,
             None,
@@ -64,7 +64,7 @@ def tracker(
 
     program = over_cores(track)
 
-    def call(simulations: Simulation, keys: Any) -> Arrays:
+    def call(simulations: Simulation, keys: RandomKey) -> Arrays:
         runs, cores = keys.shape[0], len(jax.local_devices())
         size = -(-runs // (min(PARTS, runs) * cores)) * cores
         found = []
@@ -92,7 +92,7 @@ def per_run(simulation: Simulation) -> Simulation:
     """A batch of simulations in which every leaf leads with the runs."""
     runs = simulation.measurements.value.shape[0]
 
-    def full(x: Any, rank: int) -> Any:
+    def full(x: Numbers, rank: int) -> Any:
         x = np.asarray(x)
         return x if x.ndim > rank else np.broadcast_to(x, (runs, *x.shape))
 

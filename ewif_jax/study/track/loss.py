@@ -17,7 +17,7 @@ from ewif_jax.scores import average
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.track.method import Method
 from ewif_jax.study.track.tracks import Tracks
-from ewif_jax.types import Measurement, Status
+from ewif_jax.types import Measurement, Params, Status
 
 WIDTH = 0.1
 """Of the smooth median, in units of the logarithm of the error."""
@@ -83,7 +83,7 @@ def loss(
         for tracks, measurements in batches
     ]
 
-    def loss_of_params(params: Any) -> Array:
+    def loss_of_params(params: Params) -> Array:
         given = {**method.params, **params}
         every = [
             jnp.where(here, charging.scored(given, None, score), jnp.nan).ravel()
@@ -95,7 +95,7 @@ def loss(
 
 
 def filtered(
-    method: Method, params: Any, tracks: Tracks, batches: Batches
+    method: Method, params: Params, tracks: Tracks, batches: Batches
 ) -> dict[str, np.ndarray]:
     """Estimates and diagnostics (N, ...) after every row, one batched call for tracks of like
     length."""

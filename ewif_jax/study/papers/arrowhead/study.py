@@ -18,7 +18,7 @@ from ewif_jax.study.papers.arrowhead import figures as arrowhead_figures
 from ewif_jax.study.shared.experiment import Experiment
 from ewif_jax.study.shared.late import history_needed, paired, rmse, rmses, sweep
 from ewif_jax.tuning import tune
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, PyTree
 
 Q, VARIANCE, RATIO = 20.0, 2000.0, 0.6
 AT_STALE = 5
@@ -158,7 +158,7 @@ def _example(
     return found
 
 
-def _dataset(found: Any, faded: Any, example: dict[str, np.ndarray]) -> xr.Dataset:
+def _dataset(found: PyTree, faded: Any, example: dict[str, np.ndarray]) -> xr.Dataset:
     values, errors = rmses(found["squared_error"])
     metres = {"units": "m"}
     at = {"cutoff": ("cutoff", cutoffs(), {"units": "s"})}

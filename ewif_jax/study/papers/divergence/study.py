@@ -20,7 +20,7 @@ from ewif_jax.scenarios.divergence import (
 from ewif_jax.study.papers.divergence import figures
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, Numbers, PyTree
 
 EPS, LENGTH = 0.3, 20.0
 GAINS = np.geomspace(0.05, 5.0, 60)
@@ -173,8 +173,8 @@ def _row(
     }
 
 
-def _dataset(time: np.ndarray, found: Any, exact: Any, final: Any) -> xr.Dataset:
-    def stacked(x: Any, names: tuple[str, ...], last: str) -> xr.DataArray:
+def _dataset(time: np.ndarray, found: PyTree, exact: Any, final: Any) -> xr.Dataset:
+    def stacked(x: Numbers, names: tuple[str, ...], last: str) -> xr.DataArray:
         table = np.stack([[x[push, name] for name in names] for push in PUSHES])
         return xr.DataArray(
             table,

@@ -21,7 +21,7 @@ from ewif_jax.study.papers.random_walk import figures
 from ewif_jax.study.shared.experiment import Experiment
 from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse, rmses, sweep
 from ewif_jax.tuning import tune
-from ewif_jax.types import Estimator
+from ewif_jax.types import Estimator, PyTree
 
 VARIANCE, INTERVAL, RATIO = 2500.0, 0.2, 0.6
 MULTIPLES = np.asarray([0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1, 1.5, 2, 3, 5, 10, 30, 100, np.inf])
@@ -197,7 +197,7 @@ def _gain(case: Case) -> float:
     return float(random_walk_gain(maneuvering_index(case.sigma**2, VARIANCE, INTERVAL)))
 
 
-def _methods(case: Case, found: Any) -> dict[str, Any]:
+def _methods(case: Case, found: PyTree) -> dict[str, Any]:
     squared = found["squared_error"]
     return {
         "": case.name,

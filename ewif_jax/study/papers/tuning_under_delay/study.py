@@ -20,7 +20,7 @@ from ewif_jax.study.shared.experiment import Experiment
 from ewif_jax.study.shared.figures import EWIF, OTHER, TRUTH, canvas, label
 from ewif_jax.study.shared.late import history_needed, paired, rmse, sweep
 from ewif_jax.tuning import Tuned, tune
-from ewif_jax.types import Estimator, Gaussian
+from ewif_jax.types import Estimator, Gaussian, PyTree
 
 SOFTNESS = 0.5
 """width of the soft cut-off in seconds: half the spacing of the possible delays"""
@@ -144,7 +144,7 @@ def _tuned(
         return tune(loss, start, steps=20 if experiment.options.quick else 80, progress=report)
 
 
-def _rows(one: Method, found: Any) -> list[dict[str, Any]]:
+def _rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
     squared, values, cutoffs = found["squared"], found["parameter"], found["cutoff"]
     best = 2 + int(np.argmin(squared[2:].mean(1)))
     picked = [
@@ -168,7 +168,7 @@ def _rows(one: Method, found: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _arrays(one: Method, found: Any) -> dict[str, xr.DataArray]:
+def _arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
     name, metres = one.name, {"units": "m"}
     grid = found["squared"][2:].reshape(one.grid.size, CUTOFFS.size, -1)
     return {

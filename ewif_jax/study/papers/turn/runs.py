@@ -20,7 +20,7 @@ from ewif_jax.oosm.replay import replay
 from ewif_jax.scenarios.turn import Q_TURN, SECONDS, Q, turn, turn_model, turn_state
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.one_by_one import over_cores, per_run, tracker
-from ewif_jax.types import Estimator, Status, Trace
+from ewif_jax.types import Estimator, RandomKey, Status, Trace
 
 LAG, BUFFER = 5, 12
 STD, ORD, EXT, EXACT = "PFstd", "PFord", "PFoosmEXT", "exact replay"
@@ -71,7 +71,7 @@ def sigma_points_note() -> str:
     return "PFoosmUKS and UKF: cubature points; float32 cannot carry the printed alpha = 1e-3."
 
 
-def simulated(key: Any, runs: int) -> dict[bool, Simulation]:
+def simulated(key: RandomKey, runs: int) -> dict[bool, Simulation]:
     """The same runs as they arrive (False) and in order of time (True)."""
     keys = jax.random.split(key, runs)
     return {
@@ -80,7 +80,7 @@ def simulated(key: Any, runs: int) -> dict[bool, Simulation]:
     }
 
 
-def followed(method: Method, batch: Simulation, keys: Any) -> Arrays:
+def followed(method: Method, batch: Simulation, keys: RandomKey) -> Arrays:
     """Of every run (R,) of a batch in the order that the method asks for: the track (R, 31, 2),
     squared errors of position and velocity (R, 31) at each second, counts of what became of the
     measurements, and core_seconds."""

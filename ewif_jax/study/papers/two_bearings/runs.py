@@ -26,7 +26,7 @@ from ewif_jax.scenarios.two_bearings import (
 )
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.one_by_one import over_cores, per_run, tracker
-from ewif_jax.types import Estimator, Trace
+from ewif_jax.types import Estimator, Numbers, RandomKey, Trace
 
 DELAYS = (0.0, 5.0, 10.0)
 LAG, MEMBERS = 12, 250
@@ -72,7 +72,7 @@ def methods(particles: int = 10_000) -> dict[str, Method]:
     }
 
 
-def simulated(key: Any, runs: int) -> World:
+def simulated(key: RandomKey, runs: int) -> World:
     """The same targets under every delay."""
     keys = jax.random.split(key, runs)
     batches = [per_run(simulate_batch(two_bearings(delay), keys)) for delay in DELAYS]
@@ -87,7 +87,7 @@ def simulated(key: Any, runs: int) -> World:
     return World(together, jnp.concatenate([keys] * len(DELAYS)), np.stack(times))
 
 
-def followed(method: Method, world: World, key: Any) -> Arrays:
+def followed(method: Method, world: World, key: RandomKey) -> Arrays:
     """Errors and reported variances of x and y (D, R, T, 2), NaN in the padding, and core_seconds
     (D, R) of every run."""
     batch = world.batch
@@ -107,7 +107,7 @@ def bounds(world: World) -> Arrays:
     assert prior is not None
     setting = {"start": np.asarray(START), "prior_cov": prior.cov, "t0": 0.0}
 
-    def along(key: Any, simulation: Simulation) -> dict[str, Any]:
+    def along(key: RandomKey, simulation: Simulation) -> dict[str, Any]:
         stream, truth, times = simulation
         seen, now = (two_bearings_path(key, t) for t in (stream.time, times))
         right = pcrlb_late(model, None, stream, seen, **setting, times=times)
@@ -147,7 +147,7 @@ def _padded(batch: Simulation, length: int) -> Simulation:
     """More rows that say nothing, at the time of the last one; truth is NaN there."""
     more = length - batch.truth.shape[1]
 
-    def last(x: Any) -> np.ndarray:
+    def last(x: Numbers) -> np.ndarray:
         return np.concatenate([x, np.repeat(x[:, -1:], more, axis=1)], axis=1)
 
     stream = jax.tree.map(last, batch.measurements)
