@@ -20,7 +20,7 @@ SMALL = 800
 a short stream."""
 
 
-def known(x: Numbers) -> np.ndarray | None:
+def concrete_value(x: Numbers) -> np.ndarray | None:
     """`x` as a NumPy array if its value is known now, else None."""
     return None if isinstance(x, Tracer) else np.asarray(x)
 
@@ -74,7 +74,7 @@ def finite(argument: str, x: Numbers, mask: Numbers = True, where: str = "") -> 
     value = np.asarray(x)
     got = value.dtype if value.ndim else Shown(x)
     require(_is_numeric(value), argument, "finite numbers", got)
-    asked = None if squares_are_finite(x) else known(mask)
+    asked = None if squares_are_finite(x) else concrete_value(mask)
     if asked is not None:
         bad = ~np.isfinite(value) & asked
         require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
@@ -90,7 +90,7 @@ def squares_are_finite(x: Numbers) -> bool:
 
 def positive(argument: str, x: Numbers) -> Any:
     """Refuses a value that is not positive; returns it."""
-    value = known(x)
+    value = concrete_value(x)
     if value is not None:
         require(_is_numeric(value), argument, "a positive number", Shown(x))
         require(np.all(value > 0), argument, "a positive number", _plain(value))
@@ -99,7 +99,7 @@ def positive(argument: str, x: Numbers) -> Any:
 
 def at_least(argument: str, x: Numbers, bound: float) -> Any:
     """Refuses a value below `bound`; returns it."""
-    value = known(x)
+    value = concrete_value(x)
     if value is not None:
         require(_is_numeric(value), argument, f"a number >= {bound}", Shown(x))
         require(np.all(value >= bound), argument, f"a number >= {bound}", _plain(value))
@@ -115,7 +115,7 @@ def whole(argument: str, x: Numbers, bound: int) -> int:
 
 def psd(argument: str, x: Numbers, definite: bool = False) -> Any:
     """Refuses a matrix that is not square, finite, symmetric and positive (semi)definite."""
-    value = known(x)
+    value = concrete_value(x)
     if value is None:
         return x
     kind = "positive definite" if definite else "positive semidefinite"
@@ -235,7 +235,7 @@ def stream(measurements: Measurement, batched: bool = False) -> None:
     require(integer, "measurements.sensor", "integers", sensor.dtype)
     finite("measurements.time", time)
     finite("measurements.value", value, mask, " where mask is True (mask out what is missing)")
-    seen_sensor = known(sensor)
+    seen_sensor = concrete_value(sensor)
     if seen_sensor is not None:
         low, high = seen_sensor.min(), seen_sensor.max()
         require(low >= 0, "measurements.sensor", "indices >= 0", low)
@@ -252,7 +252,7 @@ def sensor(argument: str, index: int, count: int | None) -> None:
 
 def sensors(measurements: Measurement, count: int | None) -> None:
     """Refuses a stream whose known sensor indices are not all below `count`."""
-    indices = known(measurements.sensor)
+    indices = concrete_value(measurements.sensor)
     if indices is not None:
         sensor("measurements.sensor", int(indices.max()), count)
 
@@ -261,7 +261,7 @@ def report_times(times: Numbers, steps: int) -> None:
     """Refuses report times of the wrong length, not finite, or running backwards."""
     shape("times", times, (steps,) if np.ndim(times) < 2 else ("R", steps))
     finite("times", times)
-    value = known(times)
+    value = concrete_value(times)
     if value is not None:
         back = np.diff(value) < 0
         place = (*np.argwhere(back)[0],) if back.any() else ()

@@ -125,7 +125,7 @@ def representable(
     given = ("measurements.time", time), ("t0", t0), ("times", times)
     finer = []
     for argument, x in given:
-        value = None if x is None else checks.known(x)
+        value = None if x is None else checks.concrete_value(x)
         if value is not None and value.dtype != dtype and value.dtype.kind in "iuf" and value.size:
             finer.append((argument, value.reshape(-1, value.shape[-1] if value.ndim else 1)))
     runs = max((len(value) for _, value in finer), default=0)
@@ -182,7 +182,7 @@ def _judge(
 @once
 def not_ahead(dtype: DTypeLike, time: Numbers, mask: Numbers, times: Numbers, t0: Numbers) -> None:
     """Refuses a known stamp ahead of the filter's clock (`clock="arrival"`), more than rounding."""
-    stamp, present, clock, start = map(checks.known, (time, mask, times, t0))
+    stamp, present, clock, start = map(checks.concrete_value, (time, mask, times, t0))
     if stamp is None or clock is None or present is None:
         return
     stamp, clock = stamp.astype(dtype), clock.astype(dtype)

@@ -58,7 +58,7 @@ def examined(
         dtype = float_dtype(measurements.value)
         clocks.not_ahead(dtype, measurements.time, measurements.mask, times, t0)
     check_runs(estimator, inputs, flags, t0, clock, key)
-    mask = checks.known(shown.mask)
+    mask = checks.concrete_value(shown.mask)
     complete = mask is not None and bool(mask.all())
     return flags, Content(complete, _values_at_hand(measurements)), sifted
 
@@ -136,7 +136,7 @@ def check_runs(
     dtype = float_dtype(inputs[1].value)
     check_times(estimator.model, inputs[1], t0, dtype, inputs[3])
     _, measurements, prior, times = one_run(inputs, flags)
-    sensors = checks.known(inputs[1].sensor)
+    sensors = checks.concrete_value(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:
         measurements = measurements._replace(sensor=sensors.max(0))
     key = key[0] if checks.is_typed_key(key) and key.ndim else key
@@ -185,7 +185,7 @@ def lowest(params: Params, flags: PyTree) -> set[int]:
     lowest or not finite."""
     runs = set()
     for x, per_run in zip(*map(jax.tree.leaves, (params, flags)), strict=True):
-        value = checks.known(x) if per_run and not checks.is_typed_key(x) else None
+        value = checks.concrete_value(x) if per_run and not checks.is_typed_key(x) else None
         if value is None or value.dtype.kind not in "iuf" or not value.size:
             continue
         runs.add(int(np.argmin(value.reshape(len(value), -1).min(1))))
@@ -223,7 +223,7 @@ def _worst_prior(prior: Gaussian | None, flags: PyTree) -> Gaussian | None:
     positive definite)."""
     if prior is None:
         return None
-    cov = checks.known(prior.cov) if flags.cov else None
+    cov = checks.concrete_value(prior.cov) if flags.cov else None
     k = 0
     if cov is not None:
         scale = np.maximum(np.abs(cov).max((1, 2)), np.finfo(float).tiny)

@@ -65,8 +65,8 @@ def run_parallel(
 
     Reduces to: `run(ewif(model, tau), ...)`.
     """
-    known = method in ("blocked", "associative")
-    checks.require(known, "method", "'blocked' or 'associative'", repr(method))
+    is_method = method in ("blocked", "associative")
+    checks.require(is_method, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     validated(estimator, params, measurements, prior, t0, times, "validity", None)

@@ -56,7 +56,7 @@ def indices(argument: str, x: Numbers) -> Any:
     """
     if isinstance(x, Array):
         require(jnp.issubdtype(x.dtype, jnp.integer), argument, "whole numbers", x.dtype)
-    value = checks.known(x if isinstance(x, Array) else checks.from_rows(argument, x))
+    value = checks.concrete_value(x if isinstance(x, Array) else checks.from_rows(argument, x))
     if value is None:
         return x.astype(np.int32)
     value = value if value.dtype.kind in "iu" else numbers(argument, x)

@@ -183,7 +183,7 @@ def present_values(value: Numbers, mask: Numbers) -> Any:
         ValueError: what is not numbers, or hidden and said to be present.
     """
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
-        hidden, seen = np.ma.getmaskarray(value), checks.known(mask)
+        hidden, seen = np.ma.getmaskarray(value), checks.concrete_value(mask)
         # In a batch all runs may share a mask.
         if seen is None or seen.dtype != bool:
             return plain.numbers("measurements.value", value)
@@ -216,5 +216,5 @@ def cast(measurement: Measurement, dtype: DTypeLike) -> Measurement:
 
 def in_dtype(x: Numbers, dtype: DTypeLike) -> Any:
     """`x` in `dtype`, its value known as before."""
-    value = checks.known(x)
+    value = checks.concrete_value(x)
     return jnp.asarray(x, dtype) if value is None else value.astype(dtype)

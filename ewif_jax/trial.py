@@ -45,7 +45,7 @@ def validated(
     check_times(estimator.model, measurements, t0, dtype, times)
     if clock == "arrival":
         clocks.not_ahead(dtype, measurements.time, measurements.mask, times, t0)
-    sensors = checks.known(measurements.sensor)
+    sensors = checks.concrete_value(measurements.sensor)
     last = None if sensors is None else np.int32(sensors.max())
 
     def first() -> Any:
@@ -117,8 +117,8 @@ def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable 
     leaves, structure = jax.tree.flatten(values)
     if filtered is None or any(isinstance(x, Tracer) for x in leaves):
         return None
-    known = map(np.asarray, leaves)
-    return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in known)
+    arrays = map(np.asarray, leaves)
+    return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in arrays)
 
 
 def _indexable(x: Numbers) -> Any:

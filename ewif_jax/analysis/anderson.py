@@ -258,7 +258,7 @@ def check_system(
         stacked = steps is not None and np.ndim(x) == 3
         checks.shape(label, x, (steps, *shape) if stacked else shape)  # type: ignore[arg-type]
         checks.finite(label, x)
-        value = checks.known(x)
+        value = checks.concrete_value(x)
         if field in "QR" and value is not None:
             for k, one in enumerate(value if stacked else [value]):
                 checks.psd(f"{label}[{k}]" if stacked else label, one)

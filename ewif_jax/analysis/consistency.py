@@ -28,9 +28,9 @@ def rmse(mean: Array, truth: Array, axis: int | tuple[int, ...] | None = None) -
 @partial(jax.jit, static_argnames="axis", inline=True)
 def _rms(mean: Array, truth: Array, axis: int | tuple[int, ...] | None) -> Array:
     error = mean[..., : truth.shape[-1]] - truth
-    known = jnp.all(jnp.isfinite(error), -1)
-    square = jnp.sum(jnp.square(jnp.where(known[..., None], error, 0)), -1)
-    count = jnp.sum(known, axis)
+    all_finite = jnp.all(jnp.isfinite(error), -1)
+    square = jnp.sum(jnp.square(jnp.where(all_finite[..., None], error, 0)), -1)
+    count = jnp.sum(all_finite, axis)
     mean_square = jnp.sum(square, axis) / jnp.maximum(count, 1)
     safe = jnp.where(mean_square > 0, mean_square, 1)
     return jnp.where(mean_square > 0, jnp.sqrt(safe), jnp.where(count > 0, 0, jnp.nan))
@@ -83,10 +83,10 @@ def _quadratic(error: Array, cov: Array) -> Array:
     flat = error.reshape(-1, error.shape[-1])
     matrices = cov.reshape(-1, *cov.shape[-2:])
 
-    def one(error: Array, cov: Array) -> Array:
-        known = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(cov))
-        safe = jnp.where(known, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
-        white = cholesky.forward(cholesky.factor(safe), jnp.where(known, error, 0))
-        return jnp.where(known, white @ white, jnp.nan)
+    def one_ratio(error: Array, cov: Array) -> Array:
+        all_finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(cov))
+        safe = jnp.where(all_finite, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
+        white = cholesky.forward(cholesky.factor(safe), jnp.where(all_finite, error, 0))
+        return jnp.where(all_finite, white @ white, jnp.nan)
 
-    return jax.vmap(one)(flat, matrices).reshape(lead)
+    return jax.vmap(one_ratio)(flat, matrices).reshape(lead)

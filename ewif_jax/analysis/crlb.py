@@ -76,7 +76,7 @@ def check_finite_information(model: Model, params: Params, measurements: Measure
     """Refuses a known R that is singular in components that are there: of each sensor and mask, at
     its first measurement."""
     given = (params, measurements.time, measurements.sensor, measurements.mask)
-    if any(checks.known(x) is None for x in jax.tree.leaves(given)):
+    if any(checks.concrete_value(x) is None for x in jax.tree.leaves(given)):
         return
     time, sensor, mask = (np.asarray(x) for x in given[1:])
     _, rows = np.unique(np.column_stack([sensor, mask]), axis=0, return_index=True)
@@ -112,7 +112,7 @@ def _crlb(
     time: Array,
     information: Array | None,
 ) -> Array:
-    def one(measurement: Measurement) -> Array:
+    def one_measurement(measurement: Measurement) -> Array:
         sensor, mask = measurement.sensor, measurement.mask
 
         def seen(x: Array) -> Array:
@@ -126,7 +126,7 @@ def _crlb(
         # An exact measurement has no finite information; a skipped pivot would give it none.
         return jnp.where(noise.full_rank, jnp.square(w) * white.T @ white, jnp.nan)
 
-    total = jnp.sum(jax.vmap(one)(stream), 0)
+    total = jnp.sum(jax.vmap(one_measurement)(stream), 0)
     total = total if information is None else total + information
     f = cholesky.factor(total)
     return jnp.where(f.full_rank, cholesky.inverse(f), jnp.nan)

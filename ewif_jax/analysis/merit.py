@@ -251,7 +251,7 @@ def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> Ga
     checks.shape("first_cov", cov, (n, n))
     checks.finite("F", F)
     checks.finite("H", H)
-    for k, one in enumerate(() if checks.known(Q) is None else np.asarray(Q)):
+    for k, one in enumerate(() if checks.concrete_value(Q) is None else np.asarray(Q)):
         checks.psd(f"Q[{k}]", one)
     checks.psd("R", R, definite=True)
     checks.psd("first_cov", cov)
@@ -303,7 +303,7 @@ def _cutoff(F: Array, H: Array, Q: Array, R: Array, ratio: Array) -> Array:
 
 
 def _fraction(ratio: Any) -> None:
-    value = checks.known(ratio)
+    value = checks.concrete_value(ratio)
     if value is not None:
         good = np.all((value > 0) & (value < 1))
         checks.require(good, "ratio", "a number between 0 and 1", ratio)

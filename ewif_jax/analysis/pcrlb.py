@@ -72,7 +72,7 @@ def pcrlb(
     many = jnp.ndim(truth) == 3
     truth, start = (x if many else jnp.asarray(x)[None] for x in (truth, start))
     stream, truth, first = _checked(model, params, measurements, truth, start, prior_cov, t0)
-    time = checks.known(measurements.time)
+    time = checks.concrete_value(measurements.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
     return _in_order(model, params, stream, truth, first)
@@ -256,11 +256,11 @@ def _moved(model: Model, params: Params, cov: Array, states: Array, t0: Array, t
 def _information(model: Model, params: Params, states: Array, measurement: Measurement) -> Array:
     """E[H' R^-1 H] over the true states (R, n)."""
 
-    def one(x: Array) -> Array:
+    def one_state(x: Array) -> Array:
         _, H, R = predict_measurement(model, params, x, measurement.sensor, measurement.time)
         return _precision(H, R, measurement.mask)
 
-    return jax.vmap(one)(states).mean(0)
+    return jax.vmap(one_state)(states).mean(0)
 
 
 def _precision(H: Array, R: Array, mask: Array) -> Array:
@@ -303,7 +303,7 @@ def _checked(
     checks.shape("prior_cov", prior_cov, (n, n))
     checks.psd("prior_cov", prior_cov)
     checks.shape("t0", t0, ())
-    time, begin = checks.known(measurements.time), checks.known(t0)
+    time, begin = checks.concrete_value(measurements.time), checks.concrete_value(t0)
     after = time is None or begin is None or time.min() >= begin
     checks.require(after, "measurements.time", f"times from t0 = {begin} on", time)
     dtype = float_dtype(truth)

@@ -69,7 +69,7 @@ def last_time_above(A: Array, K: Array, ratio: Array) -> Array:
             count, steps, gap, _ = carry
             return (count < STRIDES) & (steps > 0) & (gap > 32 * eps)
 
-        def back(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        def slope_back(carry: tuple[Array, ...]) -> tuple[Array, ...]:
             count, steps, _, stride = carry
             steps = jnp.maximum(steps - stride, 0)
             return count + 1, steps, *missing(steps)
@@ -78,7 +78,7 @@ def last_time_above(A: Array, K: Array, ratio: Array) -> Array:
         far = jnp.log(jnp.maximum(n * jnp.where(values == 0, 0, parts) / ratio, 1)) / decay
         far = jnp.where(fades, jnp.max(far), start)
         first = (jnp.zeros((), jnp.int32), far, *missing(far))
-        count, steps, gap, _ = lax.while_loop(going, back, first)
+        count, steps, gap, _ = lax.while_loop(going, slope_back, first)
         found = jnp.where((count < STRIDES) & jnp.isfinite(gap), steps, jnp.nan)
         return jnp.where(fades | jnp.isnan(gap), found, jnp.inf)
 

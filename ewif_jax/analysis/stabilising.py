@@ -75,7 +75,7 @@ def predicted_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
 
 def check_seen_noise(H: Array, Q: Array, R: Array) -> None:
     """Refuses a known R without which nothing keeps the innovations from being exact."""
-    given = [checks.known(x) for x in (H, Q, R)]
+    given = [checks.concrete_value(x) for x in (H, Q, R)]
     if any(x is None for x in given):
         return
     look, noise, own = (np.asarray(x, float) for x in given)

@@ -30,7 +30,7 @@ def require_steady_state(F: Array, H: Array, Q: Array, *, on_edge: Edge) -> None
     Popov, Belevitch and Hautus, every mode not inside has to be seen through H, and every mode on
     the boundary has to be driven by Q.
     """
-    values = [checks.known(x) for x in (F, H, Q)]
+    values = [checks.concrete_value(x) for x in (F, H, Q)]
     if any(value is None for value in values):
         return
     F_known, H_known, Q_known = (np.asarray(value, float) for value in values)

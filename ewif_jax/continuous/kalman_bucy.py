@@ -156,14 +156,14 @@ def split(values: tuple, dtype: DTypeLike) -> tuple[tuple, tuple]:
 def matrices(functions: tuple, constants: tuple, params: Params) -> Callable[[Array], Instant]:
     """F, G, H, Q, R and the fading rate, split, as a function of time."""
 
-    def at(t: Array) -> Instant:
+    def instant_at(t: Array) -> Instant:
         F, G, H, Q, R, rate = (
             jnp.asarray(f(params, t), t.dtype) if c is None else c
             for f, c in zip(functions, constants, strict=True)
         )
         return Instant(F, H, G @ Q @ G.T, R, rate)
 
-    return at
+    return instant_at
 
 
 def solve(
@@ -223,7 +223,7 @@ def check_solver(rtol: float | None, atol: float | None, max_steps: int) -> None
 
 def check_increasing(name: str, times: Numbers) -> None:
     """Refuses known times that are not finite, fewer than two, or do not increase."""
-    value = checks.known(times)
+    value = checks.concrete_value(times)
     if value is not None:
         checks.finite(name, value)
         increasing = value.size > 1 and bool((value[1:] > value[:-1]).all())
@@ -237,7 +237,7 @@ def _check_times(signal: Signal, times: Numbers) -> None:
     checks.shape("times", times, ("K",))
     check_increasing("times", times)
     check_increasing("signal.time", signal.time)
-    known, samples = checks.known(times), checks.known(signal.time)
+    known, samples = checks.concrete_value(times), checks.concrete_value(signal.time)
     if known is not None and samples is not None:
         inside = samples[0] <= known[0] and known[-1] <= samples[-1]
         checks.require(

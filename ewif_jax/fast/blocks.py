@@ -26,7 +26,7 @@ class Place(NamedTuple):
 
     whole: Any
     row: Array | int
-    known: Array | int
+    already_there: Array | int
     """How many of its first rows the group before has put there already."""
 
 
@@ -66,20 +66,20 @@ def scan_in_blocks(
     first = jax.tree.map(lambda x: x[0], blocks)
     shapes = jax.eval_shape(several, state, first)[1]
     shapes = jax.tree.map(lambda x: x.update(shape=(len(x), steps, *x.shape[2:])), shapes)
-    whole, row, known = (rows(shapes), 0, 0) if place is None else place
+    whole, row, already_there = (rows(shapes), 0, 0) if place is None else place
 
-    def put(carry: PyTree, numbered: PyTree) -> tuple[Any, None]:
+    def put_block(carry: PyTree, numbered: PyTree) -> tuple[Any, None]:
         state, whole = carry
         number, some = numbered
         state, seen = several(state, some)
 
         def put_one(whole: Array, new: Array) -> Array:
             flat = new.reshape(len(new), -1)
-            return _placed(whole, flat, jnp.stack([row, number * flat.shape[1]]), known)
+            return _placed(whole, flat, jnp.stack([row, number * flat.shape[1]]), already_there)
 
         return (state, jax.tree.map(put_one, whole, seen)), None
 
-    (state, whole), _ = lax.scan(put, (state, whole), (jnp.arange(steps // block), blocks))
+    (state, whole), _ = lax.scan(put_block, (state, whole), (jnp.arange(steps // block), blocks))
     return (unrolled(whole, shapes) if place is None else whole), state
 
 
@@ -117,9 +117,9 @@ def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 # before has written (`known`) are not zeros; their slopes stay with that group. (README.md: "Slopes
 # of a group are added to the whole".)
 @jax.custom_jvp
-def _placed(whole: Array, new: Array, at: Array, known: Array | int) -> Array:
+def _placed(whole: Array, new: Array, at: Array, already_there: Array | int) -> Array:
     """`new` in its place in `whole`, which has zeros there, but for `known` first rows of `new`."""
-    del known
+    del already_there
     return lax.dynamic_update_slice(whole, new, tuple(at))
 
 
@@ -127,13 +127,13 @@ def _placed(whole: Array, new: Array, at: Array, known: Array | int) -> Array:
 def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Slopes are added, not put. The transpose of adding leaves the whole as it is; that of putting
     clears it in the place, for which the compiler copies the whole, each time."""
-    whole, new, at, known = primals
-    fresh = jnp.arange(len(new))[:, None] >= known
+    whole, new, at, already_there = primals
+    fresh = jnp.arange(len(new))[:, None] >= already_there
     numbers = lax.ScatterDimensionNumbers((0, 1), (), (0, 1))
     slope = lax.scatter_add(
         tangents[0], at, jnp.where(fresh, tangents[1], 0), numbers, unique_indices=True
     )
-    return _placed(whole, new, at, known), slope
+    return _placed(whole, new, at, already_there), slope
 
 
 def rows(shapes: Any) -> Any:

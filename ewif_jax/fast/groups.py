@@ -186,14 +186,16 @@ def in_groups(
             x = jnp.concatenate([x[: begins[-2] + size], x[begins[-1] :]])
         return x.reshape(groups, size, *x.shape[1:])
 
-    def one(whole: Any, numbered: PyTree) -> tuple[Any, Any]:
+    def one_group(whole: Any, numbered: PyTree) -> tuple[Any, Any]:
         begin, known, group = numbered
         return fn(merged(group, begin), Place(whole, begin, known))
 
     split = [grouped(x) for x in flagged]
     shapes = jax.eval_shape(lambda group: fn(merged(group, 0), None)[0], [x[0] for x in split])
     shapes = jax.tree.map(lambda x: x.update(shape=(runs, *x.shape[1:])), shapes)
-    whole, last = lax.scan(one, rows(shapes), (begins, np.arange(groups) * size - begins, split))
+    whole, last = lax.scan(
+        one_group, rows(shapes), (begins, np.arange(groups) * size - begins, split)
+    )
     last = jax.tree.map(lambda x: x.reshape(groups * size, *x.shape[2:]), last)
     if groups * size > runs:
         last = jax.tree.map(lambda x: jnp.concatenate([x[: begins[-1]], x[-size:]]), last)

@@ -43,11 +43,11 @@ def joined(flagged: Sequence[Any], others: Sequence[Any], flags: PyTree) -> Any:
 def one_run(tree: PyTree, flags: PyTree, k: int = 0) -> Any:
     """Number k along the leading axis of the flagged leaves; NumPy stays NumPy, known known."""
 
-    def one(x: Numbers, flag: bool) -> Any:
-        known = checks.known(x) if flag and not _is_key(x) else None
-        return x if not flag else x[k] if known is None else known[k]
+    def of_one_run(x: Numbers, flag: bool) -> Any:
+        concrete = checks.concrete_value(x) if flag and not _is_key(x) else None
+        return x if not flag else x[k] if concrete is None else concrete[k]
 
-    return jax.tree.map(one, tree, flags)
+    return jax.tree.map(of_one_run, tree, flags)
 
 
 def runs_last(tree: PyTree, flags: PyTree) -> Any:
@@ -104,9 +104,9 @@ def on_devices(tree: PyTree, flags: PyTree, devices: int) -> Any:
     split, shared = (NamedSharding(mesh, spec) for spec in (PartitionSpec("runs"), PartitionSpec()))
     leaves, structure = jax.tree.flatten(tree)
     places = [split if flag else shared for flag in structure.flatten_up_to(flags)]
-    known = [i for i, x in enumerate(leaves) if not isinstance(x, Tracer)]
-    there = jax.device_put([_on_host(leaves[i]) for i in known], [places[i] for i in known])
-    for i, x in zip(known, there, strict=True):
+    placed = [i for i, x in enumerate(leaves) if not isinstance(x, Tracer)]
+    there = jax.device_put([_on_host(leaves[i]) for i in placed], [places[i] for i in placed])
+    for i, x in zip(placed, there, strict=True):
         leaves[i] = x
     return structure.unflatten(leaves)
 

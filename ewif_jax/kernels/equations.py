@@ -210,9 +210,9 @@ def _met(n: int) -> Callable[..., tuple[Array, ...]]:
 def _taken_out(
     row: Array, rest: Array, scale: Array, lead: Array, step: Array
 ) -> tuple[Array, Array, Array]:
-    known = lead[None] * row
-    rest = rest - known
-    return row + step[None] * rest, rest, jnp.maximum(scale, jnp.abs(known))
+    part = lead[None] * row
+    rest = rest - part
+    return row + step[None] * rest, rest, jnp.maximum(scale, jnp.abs(part))
 
 
 @kernel

@@ -79,10 +79,10 @@ def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
 
 
 def propagated(
-    a: Array, packed: Array, plus: Array, known: Array, where: Pattern | None = None
+    a: Array, packed: Array, plus: Array, remainder: Array, where: Pattern | None = None
 ) -> Array:
     """a P a' + plus, packed, NaN unless `known` ()."""
-    return _propagated(where)(a, packed, plus, known)
+    return _propagated(where)(a, packed, plus, remainder)
 
 
 def no_negative(packed: Array) -> Array:
@@ -173,10 +173,10 @@ def _eliminated(rest: Array, reciprocal: Array) -> Array:
 def _weights(row: Array, reciprocal: Array, *later: Array) -> Array:
     """The weights (m,) of an unknown: from its row when it was eliminated, and later weights."""
     end = 1 + len(later)
-    known = row[end:]
+    remainder = row[end:]
     for factor, weights in zip(row[1:end], later, strict=True):
-        known = known - factor[None] * weights
-    return known * reciprocal[None]
+        remainder = remainder - factor[None] * weights
+    return remainder * reciprocal[None]
 
 
 def _least(packed: Array) -> Array:
@@ -241,8 +241,8 @@ def _congruence(where: Pattern | None) -> Callable[[Array, Array], Array]:
 @cache
 def _propagated(where: Pattern | None) -> Callable[..., Array]:
     @kernel
-    def moved(a: Array, packed: Array, plus: Array, known: Array) -> Array:
-        return jnp.where(known[None], _moved(a, packed, where) + plus, jnp.nan)
+    def moved(a: Array, packed: Array, plus: Array, remainder: Array) -> Array:
+        return jnp.where(remainder[None], _moved(a, packed, where) + plus, jnp.nan)
 
     return moved
 

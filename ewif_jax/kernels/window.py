@@ -43,14 +43,14 @@ def _pulled(first: Array, *kept: Array) -> Array:
     runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in (first, *kept)))
     later = jnp.cumsum(first, 0) > 0
 
-    def back(pull_on: Array, one: tuple[Array, ...]) -> tuple[Array, None]:
+    def pulled_back(pull_on: Array, one: tuple[Array, ...]) -> tuple[Array, None]:
         later, H, gain, pull, F = one
         force_then = _product(_turned(F), pull_on)
         rest = pull - _product(_turned(gain), force_then)
         return jnp.where(later[None], force_then + _product(_turned(H), rest), pull_on), None
 
     start = jnp.zeros((kept[0].shape[2], *runs), kept[0].dtype)
-    return lax.scan(back, start, (later, *kept), reverse=True)[0]
+    return lax.scan(pulled_back, start, (later, *kept), reverse=True)[0]
 
 
 class Passed(NamedTuple):

@@ -199,7 +199,7 @@ def _switch(
 ) -> Array:
     """The value of the first case whose condition holds, else `otherwise`; only that is computed,
     unless the conditions differ in a batch."""
-    if all(checks.known(condition) is not None for condition, _ in cases):
+    if all(checks.concrete_value(condition) is not None for condition, _ in cases):
         return next((make for condition, make in cases if condition), otherwise)()
     index = jnp.zeros((), jnp.int32)
     for number, (condition, _) in enumerate(cases, 1):

@@ -34,7 +34,7 @@ def variance(argument: str, value: Numbers, params: Params) -> Any:
     """A variance or density () read from `params`; NaN if it turns out to be none."""
     found = resolve(value, params)
     check_variance(argument, found)
-    if checks.known(found) is not None:
+    if checks.concrete_value(found) is not None:
         return found if np.ndim(found) == 0 and not hasattr(found, "dtype") else floating(found)
     found = floating(found)
     return jnp.where((found >= 0) & (found < jnp.inf), found, jnp.nan)
@@ -49,10 +49,10 @@ def check_variance(argument: str, value: Numbers) -> None:
 
 def covariance(argument: str, value: Numbers) -> Array:
     """A covariance (m, m); NaN if it turns out to be none, by its variances and correlations."""
-    known = checks.known(value)
-    if known is not None:
-        if not np.isnan(known).any():  # NaN is the answer where no interval was asked for
-            checks.psd(argument, known)
+    concrete = checks.concrete_value(value)
+    if concrete is not None:
+        if not np.isnan(concrete).any():  # NaN is the answer where no interval was asked for
+            checks.psd(argument, concrete)
         return floating(value)
     value = floating(value)
     variances = jnp.diagonal(value)

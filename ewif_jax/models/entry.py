@@ -28,14 +28,14 @@ def check_times(
     the order of their times."""
     if model is None or model.steps is None:
         return
-    stamps = checks.known(measurements.time)
+    stamps = checks.concrete_value(measurements.time)
     if stamps is not None:
         stamps = stamps if in_order else np.sort(stamps, -1)
         check_steps(model.steps, stamps, t0, dtype)
     if times is None:
         return
     if t0 is None:
-        first = checks.known(measurements.time)
+        first = checks.concrete_value(measurements.time)
         t0 = None if first is None else first.ravel()[0]
     if t0 is not None:
         check_steps(model.steps, times, t0, dtype, "times", in_order=False)
@@ -46,9 +46,9 @@ def check_span(model: Model, sources: Any, times: Numbers) -> None:
     would have to be moved over too many steps at once."""
     if model.steps is None:
         return
-    known = [checks.known(x) for x in (*(s for s in sources if s is not None), times)]
-    stamps = [x.astype(float).ravel() for x in known if x is not None]
-    if len(stamps) < len(known) or len(known) < 2:
+    concrete = [checks.concrete_value(x) for x in (*(s for s in sources if s is not None), times)]
+    stamps = [x.astype(float).ravel() for x in concrete if x is not None]
+    if len(stamps) < len(concrete) or len(concrete) < 2:
         return
     moved = np.concatenate(stamps[:-1])
     far = max(stamps[-1].max() - moved.min(), moved.max() - stamps[-1].min())
@@ -83,7 +83,7 @@ def check_covariances_of(
     Looked at are the interval from t0 to the last of `times`, or one step, and these sensors.
     """
     given = (params, t0, times, sensors)
-    if model is None or any(checks.known(x) is None for x in jax.tree.leaves(given)):
+    if model is None or any(checks.concrete_value(x) is None for x in jax.tree.leaves(given)):
         return
     check = model.check or check_covariances(model.process_cov, model.measurement_cov)
     # NumPy asks an array of JAX for its maximum, which inside a trace is not computed now.

@@ -121,7 +121,9 @@ def linear_model(
             speak of different numbers of sensors; Q or b of one step beside an F that is a function
             of (params, t0, t1).
     """
-    checks.require(checks.known(dt) is not None, "dt", "a number, not a parameter", "a tracer")
+    checks.require(
+        checks.concrete_value(dt) is not None, "dt", "a number, not a parameter", "a tracer"
+    )
     checks.positive("dt", dt)
     steps = Steps(float(dt), checks.whole("max_steps", max_steps, 1))
     F = constant("F", F, ("n", "n")) if is_discrete(F) else named(F)

@@ -98,7 +98,7 @@ def power(one: Stride, k: Any, steps: Steps, squares: np.ndarray | None = None) 
 
     table = None if squares is None else array(squares, one.F.dtype)
     carry = total, one if table is None else one._replace(F=None)
-    count = checks.known(k)
+    count = checks.concrete_value(k)
     if count is None:
         numbers = jnp.arange(steps.max_steps.bit_length(), dtype=jnp.int32)
         return lax.scan(digit, carry, (numbers, table))[0][0]
@@ -120,7 +120,7 @@ def then(first: Stride, second: Stride, matmul: Callable, matvec: Callable) -> S
 
 def chosen(condition: Any, first: Any, second: Any) -> Any:
     """`first` where the condition holds, else `second`."""
-    is_concrete = checks.known(condition)
+    is_concrete = checks.concrete_value(condition)
     if is_concrete is not None:
         return first if is_concrete else second
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), first, second)

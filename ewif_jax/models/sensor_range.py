@@ -24,7 +24,7 @@ from ewif_jax.types import Measurement, Numbers, Params
 def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: Any) -> None:
     """Refuses a known index that the model has no sensor for, or that it clamps where it looks
     something up; a linear model does not need to know the state x."""
-    index = checks.known(sensor)
+    index = checks.concrete_value(sensor)
     if index is None or index.ndim:
         return
     checks.sensor("measurement.sensor", int(index), model.sensors)
@@ -40,7 +40,7 @@ def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: A
 def check_sensors(model: Model, params: Params, x: Numbers, measurements: Measurement) -> None:
     """`check_sensor` of the largest known index of a whole stream."""
     checks.sensors(measurements, model.sensors)
-    indices = checks.known(measurements.sensor)
+    indices = checks.concrete_value(measurements.sensor)
     if indices is not None and indices.size:
         time = jnp.asarray(measurements.time).ravel()[0]
         check_sensor(model, params, x, np.int32(indices.max()), time)
@@ -64,8 +64,8 @@ def _inside(model: Model, index: int, inputs: tuple) -> bool:
 def _size_or_index(x: Numbers) -> Any:
     aval = jax.typeof(x)
     integer = jnp.issubdtype(aval.dtype, jnp.integer) or aval.dtype == bool
-    known = checks.known(x) if integer else None
-    return aval if known is None else (aval, digest(known))
+    whole_numbers = checks.concrete_value(x) if integer else None
+    return aval if whole_numbers is None else (aval, digest(whole_numbers))
 
 
 def _clamps(model: Model, index: int, inputs: tuple) -> bool:

@@ -130,8 +130,8 @@ def bank(
         return observe, cov, residual, None, len(group)
 
     def matrix(n: int) -> tuple[Callable[..., Array], Pattern]:
-        known = [m(n) for m in matrices if m is not None]
-        table = [array(m) for m in known]
-        return (lambda params, sensor, t: choose(table, sensor)), pattern(*known)
+        matrices_here = [m(n) for m in matrices if m is not None]
+        table = [array(m) for m in matrices_here]
+        return (lambda params, sensor, t: choose(table, sensor)), pattern(*matrices_here)
 
     return observe, cov, residual, matrix, len(group)

@@ -21,7 +21,7 @@ def count_steps(steps: Steps, t0: Numbers, t1: Numbers) -> tuple[Any, Any]:
     dtype = jnp.result_type(t0, t1)
     dtype = dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
     # In NumPy where it can be: JAX would compile each of these operations by itself.
-    is_concrete = checks.known(t0) is not None and checks.known(t1) is not None
+    is_concrete = checks.concrete_value(t0) is not None and checks.concrete_value(t1) is not None
     xp = np if is_concrete else jnp
     start, end = (
         np.asarray(t).astype(dtype) if is_concrete else lax.stop_gradient(jnp.asarray(t, dtype))
@@ -63,8 +63,8 @@ def check_steps(
         argument: its name.
         in_order: whether a filter goes from each to the next, and so takes `max_steps` at once.
     """
-    given = checks.known(times)
-    start = None if t0 is None else checks.known(t0)
+    given = checks.concrete_value(times)
+    start = None if t0 is None else checks.concrete_value(t0)
     if steps is None or given is None or (start is None and t0 is not None) or not given.size:
         return
     stamps = np.atleast_1d(given).astype(float)
@@ -99,7 +99,7 @@ def check_steps(
 
 def check_interval(steps: Steps | None, argument: str, interval: Numbers) -> None:
     """Refuses a known interval () that is not whole steps of a discrete model."""
-    seconds = checks.known(interval)
+    seconds = checks.concrete_value(interval)
     if steps is None or seconds is None:
         return
     checks.require(

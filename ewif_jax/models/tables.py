@@ -57,8 +57,8 @@ def count_sensors(rows: int | None, cols: int | None) -> int | None:
 
 def pattern_of_table(H: Parameter) -> Pattern | None:
     """Where a constant matrix, or any of a table, may differ from zero."""
-    known = None if callable(H) else checks.known(H)
-    return None if known is None else pattern(*known.reshape(-1, *known.shape[-2:]))
+    values = None if callable(H) else checks.concrete_value(H)
+    return None if values is None else pattern(*values.reshape(-1, *values.shape[-2:]))
 
 
 def select(table: Array, index: Array) -> Array:

@@ -23,7 +23,7 @@ def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Numbers) -
     """Times and sensors of the first measurements that come in sequence, which tell whether a prior
     is too wide; None where something of it is traced."""
     given = prior, t0, measurements.time, measurements.sensor, measurements.mask
-    concrete = all(checks.known(x) is not None for x in jax.tree.leaves(given))
+    concrete = all(checks.concrete_value(x) is not None for x in jax.tree.leaves(given))
     if prior is None or not concrete or np.ndim(measurements.time) != 1:
         return None
     seen = np.flatnonzero(np.asarray(measurements.mask).any(-1))[: 4 * np.shape(prior.cov)[0]]
@@ -43,7 +43,7 @@ def check_prior_width(
     times, sensors = rows
     with jax.ensure_compile_time_eval():
         seen = [model.measurement_cov(params, s, times[0]) for s in np.unique(sensors)]
-        if any(checks.known(R) is None for R in seen):
+        if any(checks.concrete_value(R) is None for R in seen):
             return True  # a model that was built inside a trace holds what is not known yet
         noise = np.concatenate([np.diag(np.asarray(R)) for R in seen]).min()
         gap = np.diff(times, prepend=float(t0)).max()
@@ -52,7 +52,7 @@ def check_prior_width(
         stamps = np.append(float(t0), times).astype(dtype)
         mean = jnp.asarray(prior.mean, dtype)
         matrices = _matrices(model, params, mean, stamps[:-1], stamps[1:], sensors)
-    if any(checks.known(x) is None for x in matrices):
+    if any(checks.concrete_value(x) is None for x in matrices):
         return True
     share = _rounding(cov, [np.asarray(x, float) for x in matrices], eps)
     checks.require(

@@ -83,7 +83,9 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     ) -> tuple[ReplayState, Info]:
         size = jnp.shape(measurement.value)[0]
         checks.require(size <= width, "width", f"room for {size} components", width)
-        if checks.known(measurement.sensor) is not None:  # in the buffer it is not known any more
+        if (
+            checks.concrete_value(measurement.sensor) is not None
+        ):  # in the buffer it is not known any more
             jax.eval_shape(lambda: estimator.update(params, state.current, measurement))
         shares = state.shares
         stored, share = (None, None) if shares is None else (shares[:-1], shares[-1])

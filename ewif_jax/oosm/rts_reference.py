@@ -86,12 +86,12 @@ def _tied(
 ) -> Tie:
     """The state at `time`, between `start` and now, tied to the present one."""
 
-    def back(tie: Tie, slot: CovarianceState) -> tuple[Tie, None]:
+    def tied_back(tie: Tie, slot: CovarianceState) -> tuple[Tie, None]:
         return choose(slot.time > time, _behind(model, params, tie, slot), tie), None
 
     n = state.mean.shape[0]
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
-    nearest, _ = lax.scan(back, now, state.past)
+    nearest, _ = lax.scan(tied_back, now, state.past)
     mean, F, Q = predict_state(model, params, start.mean, start.time, time)
     cov = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q)
     tie = _behind(model, params, nearest, CovarianceState(time, mean, cov))

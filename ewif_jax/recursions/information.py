@@ -141,9 +141,9 @@ def gathered(
     """The state with further equations (k, n), their variances (k,) and targets (k,), around the
     same reference."""
 
-    def add(known: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[Any, None]:
+    def add(is_determined: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[Any, None]:
         equation, variance, target = new
-        kept, rows, answers = known
+        kept, rows, answers = is_determined
         kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance)
         return (kept, rows, equations.answered(answers, target, leads, steps)), None
 
@@ -236,12 +236,12 @@ def recentred(state: InformationState, used: Array | bool = True) -> Information
 def estimate(state: InformationState) -> Gaussian:
     """Mean and covariance of a state that is `recentred` whenever there is an estimate: the
     reference; NaN while something is unknown."""
-    known = determined(state)
-    variances = jnp.where(known, state.variances, 1)
+    is_determined = determined(state)
+    variances = jnp.where(is_determined, state.variances, 1)
     cov = equations.covariance(equations.inverse(state.rows), variances)
     return Gaussian(
-        jnp.where(known, state.mean, jnp.nan),
-        symmetric.unpack(jnp.where(known, cov, jnp.nan)),
+        jnp.where(is_determined, state.mean, jnp.nan),
+        symmetric.unpack(jnp.where(is_determined, cov, jnp.nan)),
     )
 
 
@@ -307,17 +307,17 @@ def _info(
     good: Array,
 ) -> Info:
     mask = measurement.mask
-    known = determined(state)
+    is_determined = determined(state)
     leads = equations.leading(state.rows, seen)
-    variances = jnp.where(known, state.variances, 1)
+    variances = jnp.where(is_determined, state.variances, 1)
     spread = matmul(leads * variances[None], leads.T)
     innovation = gaussian.innovate(
         difference - matvec(leads, state.targets), leads, spread + R, mask
     )
-    used = known & jnp.any(mask) & good
+    used = is_determined & jnp.any(mask) & good
     return Info(
-        jnp.where(known | ~mask, innovation.value, jnp.nan),
-        jnp.where(known, innovation.cov, jnp.nan),
+        jnp.where(is_determined | ~mask, innovation.value, jnp.nan),
+        jnp.where(is_determined, innovation.cov, jnp.nan),
         jnp.where(used, gaussian.log_density(innovation, mask), 0),
         state.time - measurement.time,
         jnp.where(good, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),

@@ -13,7 +13,7 @@ def refuse_exact(model: Model, params: Params, t0: Numbers, method: str) -> None
     """Refuses a known R that is not positive definite."""
     for sensor in range(model.sensors or 1):
         with jax.ensure_compile_time_eval():
-            R = checks.known(model.measurement_cov(params, np.int32(sensor), t0))
+            R = checks.concrete_value(model.measurement_cov(params, np.int32(sensor), t0))
         if R is None or R.ndim != 2 or R.shape[0] != R.shape[1]:
             continue
         R = R.astype(float)
@@ -41,7 +41,7 @@ def refuse_one_way(model: Model, params: Params, method: str) -> None:
     if linear is None or linear.F_where is None:
         return
     with jax.ensure_compile_time_eval():
-        back = checks.known(linear.F(params, jnp.ones(()), jnp.zeros(())))
+        back = checks.concrete_value(linear.F(params, jnp.ones(()), jnp.zeros(())))
     checks.require(
         back is None or not np.isnan(back).any(),
         "F",

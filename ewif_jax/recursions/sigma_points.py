@@ -43,7 +43,7 @@ def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> 
     checks.positive("ut_alpha", ut_alpha)
     checks.finite("ut_beta", ut_beta)
     spread = ut_alpha**2 * (n + ut_kappa)
-    number = checks.known(spread)
+    number = checks.concrete_value(spread)
     if number is not None:
         checks.require(number > 0, "ut_kappa", f"a number above -{n}, minus the states", ut_kappa)
         lost = float(jnp.finfo(dtype).eps) * n / float(number)

@@ -83,11 +83,11 @@ def by_sensor(table: Any, sensor: Array) -> Array:
             sensor gives NaN.)
     """
     checks.shape("table", table, ("S",))
-    known = checks.known(sensor)
-    if known is not None and known.size:
+    indices = checks.concrete_value(sensor)
+    if indices is not None and indices.size:
         count = np.shape(table)[0]
-        checks.require(known.min() >= 0, "sensor", "an index >= 0", known.min())
-        checks.require(known.max() < count, "sensor", f"an index below {count}", known.max())
+        checks.require(indices.min() >= 0, "sensor", "an index >= 0", indices.min())
+        checks.require(indices.max() < count, "sensor", f"an index below {count}", indices.max())
     table = jnp.asarray(table)
     table = table.astype(float_dtype(table))
     return table.at[jnp.asarray(sensor)].get(mode="fill", fill_value=jnp.nan)
@@ -99,9 +99,9 @@ def losses(key: Array, probability: Any, steps: int) -> Array:
     Raises:
         ValueError: a probability outside [0, 1]; steps < 1.
     """
-    known = checks.known(probability)
-    if known is not None:
-        inside = np.all((known >= 0) & (known <= 1))
+    chances = checks.concrete_value(probability)
+    if chances is not None:
+        inside = np.all((chances >= 0) & (chances <= 1))
         checks.require(inside, "probability", "a number between 0 and 1", probability)
     return jax.random.bernoulli(key, probability, (checks.whole("steps", steps, 1),))
 

@@ -118,8 +118,8 @@ def _batch_wls(
         H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         A, c = affine_flow(model, params, time, measurement.time, dtype)
-        known = jnp.zeros(H.shape[0], dtype) if c is None else H @ c
-        target = model.residual(measurement.value, known, measurement.sensor)
+        offset_seen = jnp.zeros(H.shape[0], dtype) if c is None else H @ c
+        target = model.residual(measurement.value, offset_seen, measurement.sensor)
         rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
         white = jnp.where(noise.full_rank, cholesky.forward(noise, rows), jnp.nan)
@@ -131,14 +131,14 @@ def _batch_wls(
         spread = cholesky.factor(prior.cov)
         return _weighted(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
 
-    def at(time: Array) -> Gaussian:
+    def fitted_at(time: Array) -> Gaussian:
         rows = jax.vmap(partial(seen_from, time))(measurements)
         rows = rows.reshape(-1, rows.shape[-1])
         if prior is not None:
             rows = jnp.concatenate([rows, believed_from(time, prior)])
         return _least_squares(rows[:, :-1], rows[:, -1])
 
-    return lax.map(at, times, batch_size=REPORTS_AT_ONCE)
+    return lax.map(fitted_at, times, batch_size=REPORTS_AT_ONCE)
 
 
 def _weighted(weight: Array, rows: Array) -> Array:

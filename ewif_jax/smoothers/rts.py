@@ -94,7 +94,7 @@ def rts(
     check_times(model, measurements, t0, dtype, in_order=False)
     check_covariances_of(model, params, t0, measurements.time, measurements.sensor)
     measurements = cast(measurements, dtype)
-    times, begin = checks.known(measurements.time), checks.known(t0)
+    times, begin = checks.concrete_value(measurements.time), checks.concrete_value(t0)
     if times is not None and begin is not None:
         early = float(times.min())
         begin = begin.astype(dtype)
@@ -133,7 +133,7 @@ def _rts(
         mean = jnp.where(measurement.time >= time, mean, jnp.nan)
         return (measurement.time, mean, cov), Moved(left, left_cov, F, Q, predicted)
 
-    def back(later: tuple[Array, Array], moved: Moved):
+    def smoothed_back(later: tuple[Array, Array], moved: Moved):
         spread = symmetric.congruence(moved.F, moved.left_cov) + moved.Q
         cross = matmul(moved.F, symmetric.unpack(moved.left_cov))
         G = cholesky.solve(cholesky.factor(symmetric.unpack(spread)), cross).T
@@ -145,6 +145,6 @@ def _rts(
 
     first = (t0, prior.mean, symmetric.pack(prior.cov))
     (_, last, last_cov), steps = lax.scan(ahead, first, in_time)
-    _, (mean, cov) = lax.scan(back, (last, last_cov), steps, reverse=True)
+    _, (mean, cov) = lax.scan(smoothed_back, (last, last_cov), steps, reverse=True)
     place = jnp.argsort(order)
     return Gaussian(mean[place], jax.vmap(symmetric.unpack)(cov)[place])

@@ -133,11 +133,11 @@ def _two_sided(
     past, future = gathered(reverse=False), gathered(reverse=True)
     count = jnp.searchsorted(in_time.time, times, side="right")
 
-    def at(time: Array, k: Array) -> Gaussian:
+    def smoothed_at(time: Array, k: Array) -> Gaussian:
         sources = [jax.tree.map(lambda x: x[k], side) for side in (past, future)]
         if prior is not None:
             sources.append(form.start(model, params, prior, t0))
         moved_here = [moved(source, time) for source in sources]
         return form.estimate(form.recentred(reduce(form.joined, moved_here)))
 
-    return jax.vmap(at)(times, count)
+    return jax.vmap(smoothed_at)(times, count)

@@ -24,7 +24,7 @@ def value_and_gradient(loss: Loss, params: Params, *rest: Any) -> tuple[Array, A
     if flat.size > FORWARD_UP_TO:
         return jax.value_and_grad(loss)(params, *rest)
 
-    def of(x: Array) -> Array:
+    def loss_of_vector(x: Array) -> Array:
         return loss(unflatten(x), *rest)
 
     def along(pair: Array) -> tuple[Array, Array]:
@@ -34,12 +34,12 @@ def value_and_gradient(loss: Loss, params: Params, *rest: Any) -> tuple[Array, A
         """
         first, second = pair
         (value, one), (other, _) = jax.jvp(
-            lambda x: jax.jvp(of, (x,), (first,)), (flat,), (second,)
+            lambda x: jax.jvp(loss_of_vector, (x,), (first,)), (flat,), (second,)
         )
         return value, jnp.stack([one, other])
 
     if flat.size == 1:
-        value, slope = jax.jvp(of, (flat,), (jnp.ones_like(flat),))
+        value, slope = jax.jvp(loss_of_vector, (flat,), (jnp.ones_like(flat),))
         return value, unflatten(slope[None])
     directions = jnp.eye(flat.size + flat.size % 2, flat.size, dtype=flat.dtype)
     values, slopes = lax.map(along, directions.reshape(-1, 2, flat.size))

@@ -30,13 +30,13 @@ def smooth_median(length: Array) -> Array:
     w -> 0. Its gradient is the average of the gradients of the x_i near m, so what the worst
     predictions do does not matter.
     """
-    known = jnp.isfinite(length)
-    logs = jnp.log(jnp.where(known, length, 1) + jnp.finfo(length.dtype).tiny)
+    is_finite = jnp.isfinite(length)
+    logs = jnp.log(jnp.where(is_finite, length, 1) + jnp.finfo(length.dtype).tiny)
     fixed = lax.stop_gradient(logs)
-    count = jnp.maximum(jnp.sum(known), 1)
+    count = jnp.maximum(jnp.sum(is_finite), 1)
 
     def below(m: Array, logs: Array) -> Array:
-        return jnp.sum(jnp.where(known, jax.nn.sigmoid((m - logs) / WIDTH), 0)) / count
+        return jnp.sum(jnp.where(is_finite, jax.nn.sigmoid((m - logs) / WIDTH), 0)) / count
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (bounds[0] + bounds[1]) / 2
@@ -44,8 +44,8 @@ def smooth_median(length: Array) -> Array:
         return jnp.where(low, middle, bounds[0]), jnp.where(low, bounds[1], middle)
 
     ends = (
-        jnp.min(fixed, where=known, initial=jnp.inf),
-        jnp.max(fixed, where=known, initial=-jnp.inf),
+        jnp.min(fixed, where=is_finite, initial=jnp.inf),
+        jnp.max(fixed, where=is_finite, initial=-jnp.inf),
     )
     low, high = lax.fori_loop(0, 60, halve, ends)
     m = (low + high) / 2

@@ -62,7 +62,7 @@ def actual(case: Case, keys: Array) -> tuple[np.ndarray, np.ndarray]:
     in its last estimate."""
     steps = case.lag + SETTLING
 
-    def one(key: Array) -> tuple[Array, Array]:
+    def one_run(key: Array) -> tuple[Array, Array]:
         time = poisson_times(key, case.interval, steps)
         between = jnp.diff(time)
         F, Q = jax.vmap(case.F)(between), jax.vmap(case.Q)(between)
@@ -70,7 +70,7 @@ def actual(case: Case, keys: Array) -> tuple[np.ndarray, np.ndarray]:
         found = gain_history(F, case.H, Q, jnp.eye(1), first, case.lag)
         return time[-1] - time[::-1][: case.lag + 1], found.gain[-1, :, :, 0]
 
-    ages, gains = jax.jit(jax.vmap(one))(keys)
+    ages, gains = jax.jit(jax.vmap(one_run))(keys)
     return np.asarray(ages), np.asarray(gains)
 
 

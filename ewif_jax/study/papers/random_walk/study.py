@@ -114,14 +114,14 @@ def _simulated(
 ) -> Simulation:
     """`runs` runs of each case, one case after the other."""
 
-    def one(q: Array, delay: Array, key: Array) -> Simulation:
+    def one_run(q: Array, delay: Array, key: Array) -> Simulation:
         return random_walk(q, VARIANCE, INTERVAL, delay, steps).simulate(key)
 
     with experiment.timed("simulation"):
         q = jnp.repeat(jnp.asarray([case.sigma**2 for case in cases]), runs)
         delay = jnp.repeat(jnp.asarray([case.delay for case in cases]), runs)
         keys = jax.random.split(experiment.key(number), q.size)
-        return jax.block_until_ready(jax.jit(jax.vmap(one))(q, delay, keys))
+        return jax.block_until_ready(jax.jit(jax.vmap(one_run))(q, delay, keys))
 
 
 def _by_cutoff(

@@ -102,7 +102,7 @@ def bounds(batch: Simulation) -> Arrays:
         "times": np.repeat(TIMES, 2),
     }
 
-    def of(stream: Any, noise: Any) -> dict[str, Any]:
+    def errors_of(stream: Any, noise: Any) -> dict[str, Any]:
         bound = pcrlb_late(model, noise, stream, turn_state(stream.time), **setting)[1::2]
         variances = jnp.diagonal(bound, axis1=1, axis2=2)
         return {"position": variances[:, :2].sum(1), "velocity": variances[:, 2:4].sum(1)}
@@ -112,7 +112,7 @@ def bounds(batch: Simulation) -> Arrays:
     alone = (stream.sensor == 0) | (np.arange(runs + 2) < runs)[:, None]
     stream = stream._replace(mask=stream.mask & alone[..., None])
     noise = np.asarray([(Q, Q_TURN)] * (runs + 1) + [(0.0, 0.0)])
-    found = over_cores(of)(stream, noise)
+    found = over_cores(errors_of)(stream, noise)
     parts = {"late_": slice(runs), "": runs, "parametric_": runs + 1}
     return {
         begin + kind: np.mean(np.atleast_2d(x[part]), 0)

@@ -47,10 +47,10 @@ def _means(model: Model, tau: Array, measurements: Measurement, times: Array) ->
     own = [x.ndim > rank for x, rank in zip(measurements, RANKS, strict=True)]
     axes: Any = Measurement(*(0 if each else None for each in own))  # type: ignore[arg-type]
 
-    def one(stream: Measurement, times: Array) -> Array:
+    def one_run(stream: Measurement, times: Array) -> Array:
         return two_sided_ewif(model, None, stream, tau=tau, times=times).mean
 
-    return jax.vmap(one, (axes, 0 if times.ndim == 2 else None))(measurements, times)
+    return jax.vmap(one_run, (axes, 0 if times.ndim == 2 else None))(measurements, times)
 
 
 def _mean_square(means: np.ndarray, truth: np.ndarray) -> np.ndarray:
