@@ -46,10 +46,10 @@ def ewif(
     `init` accepts `prior=None` (nothing is known about the state): `estimate` is then NaN until
     the measurements determine the state to rounding, and the log likelihood of the measurements up
     to there is 0. A prior counts as a measurement of the whole state at t0 and decays like one.
-    Once determined it stays so: after a gap of any length the variances are large, at most the root
-    of the largest number, and new measurements replace what is old. A state that the motion makes
-    certain (stable, and faster than information decays) is known with a variance down to rounding
-    of its component.
+    After a gap so long that the weights underflow (88 tau in float32, 709 in float64) the estimate
+    is NaN again, until new measurements determine the state; over shorter gaps one after the other
+    variances grow up to a largest one. A state that the motion makes certain (stable, and faster
+    than information decays) is known with a variance down to rounding of its component.
 
     A measurement without noise (a singular R) is refused if R is known, else `REJECTED`: an R that
     tends to 0 still weights such measurements among themselves. So is one whose way back has no

@@ -16,8 +16,8 @@ def largest_variance(dtype: DTypeLike) -> float:
 def grown(variances: Array, growth: Array | float) -> Array:
     """Variances times `growth`, but no larger than `largest_variance`.
 
-    So what was known never becomes nothing, its derivatives stay finite, and the prediction after
-    any gap is still one. What is infinite, or grows without bound at once, becomes infinite.
+    So what was known does not become nothing bit by bit, and its derivatives stay finite. What is
+    infinite, or grows without bound at once, becomes infinite.
     """
     growth = jnp.asarray(growth, variances.dtype)
     ceiling = largest_variance(variances.dtype)
@@ -28,10 +28,12 @@ def grown(variances: Array, growth: Array | float) -> Array:
 
 
 def exponential(age: Array, tau: Array) -> Array:
-    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives."""
+    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives; infinite where
+    the weight exp(-age / tau) underflows: nothing is known any more."""
     dtype = jnp.result_type(age, tau)
     most = float(np.log(largest_variance(dtype)))
-    return jnp.exp(jnp.clip(age / tau, -most, most))
+    forgotten = age / tau > float(np.log(float(jnp.finfo(dtype).max)))
+    return jnp.where(forgotten, jnp.inf, jnp.exp(jnp.clip(age / tau, -most, most)))
 
 
 def reciprocal_square(weight: Array) -> Array:
