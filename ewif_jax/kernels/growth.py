@@ -28,8 +28,8 @@ def grown(variances: Array, growth: Array | float) -> Array:
 
 
 def exponential(age: Array, tau: Array) -> Array:
-    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives; infinite where
-    the weight exp(-age / tau) underflows: nothing is known any more."""
+    """exp(age / tau), saturated at `largest_variance` (either way), with derivatives; infinite
+    where the weight exp(-age / tau) underflows: nothing is known any more."""
     dtype = jnp.result_type(age, tau)
     most = float(np.log(largest_variance(dtype)))
     forgotten = age / tau > float(np.log(float(jnp.finfo(dtype).max)))
