@@ -107,7 +107,8 @@ def monte_carlo(
             score, or what `run` refuses.
     """
     runs = checks.whole("runs", runs, 2)
-    _require_key(key, runs)
+    checks.require(key is not None, "key", "a PRNG key (jax.random.key(0))", None)
+    checks.random_key(key, runs)
     if chunk is None:
         first = key[0] if _one_for_each(key) else key
         steps = jax.eval_shape(scenario.simulate, first).measurements.value.shape[0]
@@ -192,18 +193,6 @@ def _standard_error(found: _Moments) -> np.ndarray:
 def _one_for_each(key: RandomKey) -> bool:
     """Whether these are typed keys along an axis of runs (a raw key has an axis of its own)."""
     return jnp.ndim(key) == 1 and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-
-
-def _require_key(key: RandomKey, runs: int) -> None:
-    """Refuses what is no key: an int would be taken for one in some calls and not in others."""
-    checks.needs_key(key, "monte_carlo")
-    dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    raw = dtype == np.uint32 and np.ndim(key) == 1
-    expected = "a PRNG key (jax.random.key(0)), or one typed key for each run"
-    checks.require(typed or raw, "key", expected, type(key).__name__ if dtype is None else dtype)
-    if typed:
-        checks.require(key.shape in ((), (runs,)), "key", expected, f"shape {key.shape}")
 
 
 @jax.jit

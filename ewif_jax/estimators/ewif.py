@@ -103,7 +103,9 @@ def ewif(
         return jnp.isfinite(time)
 
     recursion = Recursion("ewif", start, move, measure, estimate, any_time)
-    recursion = recursion._replace(moves_back=True, starts_from_nothing=True, keeps=True)
+    recursion = recursion._replace(
+        moves_back=True, starts_from_nothing=True, inverts_prior=True, keeps=True
+    )
     return estimator_from(recursion._replace(model=without_process_noise(model)))
 
 

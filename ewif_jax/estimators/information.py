@@ -61,5 +61,7 @@ def information(model: Model) -> Estimator:
 
     recursion = Recursion("information", start, move, measure, estimate, model=model)
     estimated = ("mean", "variances", "rows", "targets")
-    recursion = recursion._replace(starts_from_nothing=True, keeps=True, estimated=estimated)
+    recursion = recursion._replace(
+        starts_from_nothing=True, inverts_prior=True, keeps=True, estimated=estimated
+    )
     return estimator_from(recursion)

@@ -117,5 +117,5 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         return form.estimate(fit(params, state, state.time))
 
     recursion = Recursion("limited_memory", first_state, move, measure, estimate, is_inside)
-    recursion = recursion._replace(moves_back=True, starts_from_nothing=True)
+    recursion = recursion._replace(moves_back=True, starts_from_nothing=True, inverts_prior=True)
     return estimator_from(recursion._replace(model=without_process_noise(model)))

@@ -119,20 +119,26 @@ def _pieces(rows: Array, n: int) -> list[Array]:
     return [rows[a:b] for a, b in pairwise(ends)]
 
 
+def _stacked(parts: list[Array]) -> Array:
+    """Along a new first axis; what all runs share is repeated where others are of one run."""
+    runs = jnp.broadcast_shapes(*(x.shape for x in parts))
+    return jnp.stack([jnp.broadcast_to(x, runs) for x in parts])
+
+
 @kernel
 def _solved(rows: Array, targets: Array) -> Array:
     n, found = targets.shape[0], []
     for k, row in reversed(list(enumerate(_pieces(rows, n)))):
         terms = [targets[k], *(-row[j] * x for j, x in enumerate(found))]
         found.insert(0, total(terms))
-    return jnp.stack(found)
+    return _stacked(found)
 
 
 @kernel
 def _times(rows: Array, x: Array) -> Array:
     n = x.shape[0]
     pieces = enumerate(_pieces(rows, n))
-    return jnp.stack(
+    return _stacked(
         [total([x[k], *(row[j] * x[k + 1 + j] for j in range(n - 1 - k))]) for k, row in pieces]
     )
 
@@ -172,7 +178,7 @@ def _absorbed(
 def _together(
     found: list[tuple[Array, Array, Array, Array]], rows: Array
 ) -> tuple[Array, Array, Array, Array]:
-    variances, leads, steps = (jnp.stack([x[i] for x in found]) for i in (0, 2, 3))
+    variances, leads, steps = (_stacked([x[i] for x in found]) for i in (0, 2, 3))
     runs = jnp.broadcast_shapes(variances.shape[1:], rows.shape[1:])
     parts = [jnp.broadcast_to(x[1], (len(x[1]), *runs)) for x in found]
     return variances, jnp.concatenate(parts), leads, steps
@@ -221,7 +227,7 @@ def _answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Ar
     for k in range(targets.shape[0]):
         left = left - leads[k] * targets[k]
         new.append(targets[k] + steps[k] * left)
-    return jnp.stack(new)
+    return _stacked(new)
 
 
 @kernel
@@ -274,7 +280,7 @@ def _spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
         zeros = jnp.zeros((n - 1 - j, *column.shape[1:]), column.dtype)
         columns.insert(0, jnp.concatenate([column, zeros]))
         kept.insert(0, variance)
-    return jnp.stack(columns, 1), jnp.stack(kept)
+    return jnp.stack(columns, 1), _stacked(kept)
 
 
 def _projected(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:

@@ -74,6 +74,7 @@ class Recursion(NamedTuple):
         the fields `estimated` of the state.
     model: of which the filter is one; its times are checked with it.
     starts_from_nothing: `init` accepts prior=None.
+    inverts_prior: its covariance has to be positive definite.
     draws: `init` needs a key.
     keeps: a measurement of which nothing is present leaves the state as it is, to the last bit. A
         batch then pays nothing for measurements that are not used; otherwise the contract selects
@@ -88,6 +89,7 @@ class Recursion(NamedTuple):
     reach: Reach | None = None
     moves_back: bool = False
     starts_from_nothing: bool = False
+    inverts_prior: bool = False
     draws: bool = False
     keeps: bool = False
     estimated: tuple[str, ...] = ("mean", "cov")
@@ -104,6 +106,8 @@ def estimator_from(recursion: Recursion) -> Estimator:
         checks.prior(prior)
         if recursion.draws:
             checks.needs_key(key, name)
+        if recursion.inverts_prior and prior is not None:
+            checks.psd("prior.cov", prior.cov, definite=True)
         if prior is None:
             return start(params, None, _floating(t0), key)
         mean = jnp.asarray(prior.mean)

@@ -11,7 +11,7 @@ from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.steps import check_interval
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Gaussian, Parameter, Params
+from ewif_jax.types import Estimator, Gaussian, Numbers, Parameter, Params, RandomKey
 
 
 @from_recipe
@@ -45,11 +45,17 @@ def fixed_lag_ewif(
     if not callable(lag):
         _check_lag(model, lag)
 
+    def init(
+        params: Params, prior: Gaussian | None, t0: Numbers, key: RandomKey = None
+    ) -> InformationState:
+        _check_lag(model, resolve(lag, params))
+        return filtered.init(params, prior, t0, key)
+
     def estimate(params: Params, state: InformationState) -> Gaussian:
         behind = _check_lag(model, resolve(lag, params))
         return filtered.estimate(params, filtered.predict(params, state, state.time - behind))
 
-    return Estimator(*filtered[:3], estimate, model=filtered.model)
+    return Estimator(init, filtered.predict, filtered.update, estimate, model=filtered.model)
 
 
 def _check_lag(model: Model, lag: Parameter) -> Any:

@@ -37,7 +37,7 @@ def test_process_noise_in_the_plane_is_that_on_a_line():
 def test_where_no_tau_has_the_wanted_error_the_nearest_is_named():
     """A steady value and no process noise: no forgetting is as good, the longest tau is nearest."""
     time = np.arange(1.0, 31)
-    case = ej.Case(ej.stream(time, np.zeros(30)), np.zeros((30, 1)), 2.0, 0.0)
+    case = ej.analysis.Case(ej.stream(time, np.zeros(30)), np.zeros((30, 1)), 2.0, 0.0)
     still = ej.models.random_walk(sensors=ej.models.position_sensor(2.0), q=0.0)
     with pytest.raises(ValueError, match=r"case: expected a value from 0\.1 to 5 .* nearest is 5"):
         ej.equivalent_tau(still, dt=1.0, steps=30, case=case, bounds=(0.1, 5.0))
@@ -54,7 +54,7 @@ def test_a_search_without_a_finite_gain_names_the_bounds():
 
 def test_the_band_of_nees_is_right_in_float32():
     with jax.enable_x64(False):
-        low, high = ej.chi2_band(6, 100_000)
+        low, high = ej.analysis.chi2_band(6, 100_000)
     # The normal limit of a mean of chi-squares: 6 -+ 1.96 sqrt(12 / N).
     np.testing.assert_allclose(
         [low, high], 6 + 1.959964 * np.sqrt(2 * 6 / 1e5) * np.array([-1, 1]), rtol=1e-5
