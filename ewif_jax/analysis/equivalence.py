@@ -29,16 +29,19 @@ class Case(NamedTuple):
 
 def settled_gain(estimator: Estimator, params: Params, m: int, dt: float, steps: int) -> Array:
     """The filter's gain (n, m) after `steps` equally spaced measurements of m components, started
-    from nothing: the derivative of the estimate by the last measurement."""
+    from nothing: the derivative of the estimate by the last measurement; NaN without an estimate."""
     dtype = jnp.asarray(0.0).dtype
     time = jnp.arange(1, steps + 1, dtype=dtype) * dt
 
-    def last(value: Array) -> Array:
+    def last(value: Array) -> tuple[Array, Array]:
         values = jnp.zeros((steps, m), dtype).at[-1].set(value)
         stream = Measurement(time, values, jnp.zeros(steps, jnp.int32), jnp.ones((steps, m), bool))
-        return run(estimator, params, stream, prior=None, t0=jnp.zeros((), dtype)).mean[-1]
+        mean = run(estimator, params, stream, prior=None, t0=jnp.zeros((), dtype)).mean[-1]
+        return mean, mean
 
-    return jax.jacfwd(last)(jnp.zeros(m, dtype))
+    gain, mean = jax.jacfwd(last, has_aux=True)(jnp.zeros(m, dtype))
+    # What says nothing says so whatever is measured: its derivative alone would be 0.
+    return jnp.where(jnp.isnan(mean)[:, None], jnp.nan, gain)
 
 
 def equivalent_tau(
