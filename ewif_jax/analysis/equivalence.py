@@ -29,7 +29,7 @@ class Case(NamedTuple):
 
 def settled_gain(estimator: Estimator, params: Params, m: int, dt: float, steps: int) -> Array:
     """The filter's gain (n, m) after `steps` equally spaced measurements of m components, started
-    from nothing: the derivative of the estimate by the last measurement; NaN without an estimate."""
+    from nothing: the derivative of the estimate by the last measurement; NaN without one."""
     dtype = jnp.asarray(0.0).dtype
     time = jnp.arange(1, steps + 1, dtype=dtype) * dt
 
