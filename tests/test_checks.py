@@ -361,9 +361,9 @@ REFUSED = {
         lambda: ej.steady_state_gain(np.ones((2, 3)), ROW, SQUARE, 1.0),
         "F: expected shape (2, 2), got shape (2, 3)",
     ),
-    "R = 0, for a gain": (
-        lambda: ej.delayed_gain(1.0, 1.0, 1.0, 0.0, 2),
-        "R: expected a positive definite matrix, got smallest eigenvalue 0",
+    "R < 0, for a gain": (
+        lambda: ej.delayed_gain(1.0, 1.0, 1.0, -1.0, 2),
+        "R: expected a positive semidefinite matrix, got smallest eigenvalue -1",
     ),
     "NaN in F, for a gain": (
         lambda: ej.steady_state_gain(np.nan, 1.0, 1.0, 1.0),

@@ -152,6 +152,8 @@ def deliver(
         mask = mask & ~jnp.asarray(plain.booleans("lost", lost))[:, None]
     arrival = time + jnp.asarray(delay, dtype)
     order = jnp.argsort(arrival, stable=True)
-    measurements = Measurement(time, jnp.where(mask, value, 0), sensor, mask)
+    # What was lost keeps its number; what is none would reach derivatives.
+    value = jnp.where(jnp.isfinite(value), value, 0)
+    measurements = Measurement(time, value, sensor, mask)
     sorted_in = jax.tree.map(lambda x: x[order], measurements)
     return Delivery(sorted_in, arrival[order], order)

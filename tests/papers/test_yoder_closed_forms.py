@@ -260,8 +260,8 @@ def test_gradients():
 
 
 def test_what_is_refused():
-    with pytest.raises(ValueError, match="R: expected a positive definite matrix"):
-        steady_state_gain(1.0, 1.0, 1.0, 0.0)
+    with pytest.raises(ValueError, match="R: expected a positive semidefinite matrix"):
+        steady_state_gain(1.0, 1.0, 1.0, -1.0)
     with pytest.raises(ValueError, match=r"Q: expected shape \(2, 2\)"):
         steady_state_gain(F, H, 1.0, 1.0)
     with pytest.raises(ValueError, match="ratio"):

@@ -51,8 +51,9 @@ def _responses(estimator: Estimator, n: int, times: Array) -> tuple[Array, Array
         return trace.mean[-1], trace.cov[-1]
 
     # What a linear filter makes of a single 1 is a column of its response.
-    over_places = jax.vmap(last, (0, None), (1, None))
-    return jax.vmap(over_places, (None, 0))(jnp.eye(times.shape[1]), times)
+    over_places = jax.vmap(last, (0, None), (1, 0))
+    response, covs = jax.vmap(over_places, (None, 0))(jnp.eye(times.shape[1]), times)
+    return response, covs[:, 0]  # which depends on no value
 
 
 def sources(model: Model, n: int, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
