@@ -100,5 +100,5 @@ print(time.process_time() - begin)
 
 def test_importing_takes_a_third_of_a_second():
     command = [sys.executable, "-c", QUICK]
-    took = min(float(subprocess.check_output(command)) for _ in range(3))
+    took = min(float(subprocess.check_output(command)) for _ in range(5))
     assert took <= 0.35

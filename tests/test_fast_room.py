@@ -16,7 +16,7 @@ from ewif_jax.fast import memo
 from ewif_jax.fast.memo import Memo, once, question_of, remembered
 
 ROOM = Path(memo.__file__).parent
-BELOW = ("ewif_jax.recipe", "ewif_jax.types", "ewif_jax.checks", "ewif_jax.fast")
+BELOW = ("ewif_jax.recipe", "ewif_jax.plain", "ewif_jax.types", "ewif_jax.checks", "ewif_jax.fast")
 PRIOR = ej.Gaussian(np.zeros(1), np.eye(1))
 STREAM = ej.stream(np.arange(1.0, 4.0), np.zeros(3))
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.linalg import block_diag
 
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
@@ -60,7 +59,8 @@ def fixed_point(
         """All but the last `still` components."""
         mean, cov = state.mean, state.cov
         moved, F, Q = flow_around(model, points, params, mean, cov, state.time, time, still)
-        F = block_diag(F, jnp.eye(still, dtype=F.dtype))
+        stands = jnp.append(jnp.zeros(F.shape[0], F.dtype), jnp.ones(still, F.dtype))
+        F = jnp.pad(F, (0, still)) + jnp.diag(stands)
         Q = jnp.pad(Q, (0, still))
         mean = jnp.concatenate([moved, mean[n:]])
         return CovarianceState(time, mean, symmetric.congruence(F, cov) + symmetric.pack(Q))

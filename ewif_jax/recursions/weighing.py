@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.special import logsumexp
+from jax.nn import logsumexp
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
