@@ -98,6 +98,7 @@ print(time.process_time() - begin)
 """
 
 
+@pytest.mark.slow  # what other processes do at the same time counts too
 def test_importing_takes_a_third_of_a_second():
     command = [sys.executable, "-c", QUICK]
     took = min(float(subprocess.check_output(command)) for _ in range(5))
