@@ -62,7 +62,9 @@ def test_gradient_is_the_finite_difference(scale):
         return jnp.sum(smoothed.mean**2) + jnp.sum(smoothed.cov)
 
     step = 1e-5
-    slope = (loss(scale + step) - loss(scale - step)) / (2 * step)
+    # Below q = 0 there is no model: from there on only one side says what the slope is.
+    shifts, weights = ((1, -1), (0.5, -0.5)) if scale else ((0, 1, 2), (-1.5, 2.0, -0.5))
+    slope = sum(w * loss(scale + k * step) for k, w in zip(shifts, weights, strict=True)) / step
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(scale), slope, rtol=1e-6)
 
 
