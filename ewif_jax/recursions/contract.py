@@ -173,15 +173,3 @@ def offered(
 def _floating(t0: Numbers) -> Array:
     t0 = jnp.asarray(t0)
     return t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)
-
-
-def verdict(
-    late: Array,
-    present: Array,
-    late_status: Status | Array = Status.TOO_LATE,
-    good: Array | bool = True,
-) -> Array:
-    """The status of an update that has nothing more to say than "late", "present" and "good"."""
-    status = jnp.where(late, late_status, Status.USED)
-    status = jnp.where(good | (status == Status.TOO_LATE), status, Status.REJECTED)
-    return jnp.where(present, status, Status.MASKED).astype(jnp.int32)
