@@ -169,9 +169,9 @@ def test_the_memo_keeps_neither_parameters_nor_functions(entry):
     H = Closure()
     params = {"c": jnp.ones(10_000)}
     gone = [weakref.ref(H), weakref.ref(params["c"])]
-    before = len(memo.ANSWERS)
+    memo.ANSWERS.clear()
     filtered(entry, H, params)
-    assert len(memo.ANSWERS) > before
+    assert len(memo.ANSWERS) > 0
     questions = [str(question) for question in memo.ANSWERS._answers]
     assert max(map(len, questions)) < 20_000  # of 80,000 bytes
     del H, params

@@ -54,6 +54,11 @@ class Memo:
             while len(self._answers) > self.most:
                 self._answers.popitem(last=False)
 
+    def clear(self) -> None:
+        """Forgets all."""
+        with self._lock:
+            self._answers.clear()
+
 
 ANSWERS = Memo(MOST_ANSWERS)
 """The one that the package has."""
