@@ -71,9 +71,14 @@ def charging_of(
     def fresh(unknowns: int) -> Any:
         return charges(scores.as_batch(measurements), unknowns)
 
-    # What is traced belongs to one trace, and must not be kept for the next.
+    @cache
+    def kept(unknowns: int) -> Any:
+        # Else what is made of known numbers inside of a trace would belong to that trace.
+        with jax.ensure_compile_time_eval():
+            return fresh(unknowns)
+
     is_traced = any(isinstance(x, Tracer) for x in measurements)
-    return Charging(estimator, measurements, setting, fresh if is_traced else cache(fresh), unused)
+    return Charging(estimator, measurements, setting, fresh if is_traced else kept, unused)
 
 
 def value_charging(

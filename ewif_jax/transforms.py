@@ -33,6 +33,12 @@ def positive() -> Transform:
 
 
 @from_recipe
+def negative() -> Transform:
+    """Negative numbers through the logarithm of their size."""
+    return Transform(_minus_exponential, _logarithm_of_size)
+
+
+@from_recipe
 def bounded(low: float, high: float) -> Transform:
     r"""Numbers between `low` and `high`, through the logistic function.
 
@@ -87,6 +93,14 @@ def _exponential(x: Array) -> Array:
 
 def _logarithm(x: Array) -> Array:
     return jnp.log(x)
+
+
+def _minus_exponential(x: Array) -> Array:
+    return -jnp.exp(x)
+
+
+def _logarithm_of_size(x: Array) -> Array:
+    return jnp.log(-x)
 
 
 def _from_root(raw: Array) -> Array:

@@ -1,6 +1,7 @@
 """Parameters from data: `tune`, and the value and gradient it goes by."""
 
-from ewif_jax.tuning.gradient_descent import Tuned, tune
+from ewif_jax.tuning.minimise import tune
+from ewif_jax.tuning.tuned import Tuned
 from ewif_jax.tuning.value_gradient import value_and_gradient
 
 __all__ = ["Tuned", "tune", "value_and_gradient"]
