@@ -190,7 +190,7 @@ def tried(problem: Problem, options: dict[str, Any], starts: dict[str, Any]) -> 
     return {
         "losses": [t.loss for t in tuned.starts],
         "first_losses": [float(t.history["loss"][0]) for t in tuned.starts],
-        "evaluations": [len(t.history["loss"]) for t in tuned.starts],
+        "evaluations": [t.evaluations for t in tuned.starts],
         "reasons": [t.reason for t in tuned.starts],
         "params": [{k: float(v) for k, v in t.params.items()} for t in tuned.starts],
         "first_s": first,

@@ -86,12 +86,13 @@ def descend(descents: list[Descent], pricer: Pricer, most: int, progress: Told |
     for turn in range(most):
         running = [d for d in descents if d.ended is None]
         if not running:
-            return
+            break
         points = [d.coordinates.leaves(d.point) for d in running if d.point is not None]
         for descent, price in zip(running, pricer.prices(points, turn), strict=True):
             descent.told(*price)
         if progress is not None:
-            progress(turn + 1, most, float(np.min([d.losses[-1] for d in running])))
+            told = turn + 1 if any(d.ended is None for d in descents) else most
+            progress(told, most, float(np.min([d.losses[-1] for d in running])))
 
 
 class Reached(NamedTuple):

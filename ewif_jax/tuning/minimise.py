@@ -156,15 +156,13 @@ def tune(
         descents.append(Descent(asking, coordinates, key is None, held_out, patience))
     descend(descents, pricer, steps, progress)
     label = chosen if optimizer is None else "optimizer"
-    found = [
-        tuned_from(d, objective, held, domain, names, label, steps, pricer.evaluations)
-        for d in descents
-    ]
+    found = [tuned_from(d, objective, held, domain, names, label, steps) for d in descents]
     first = [t.history["loss"][0] for t in found]
     got = f"{first[0]} at the starting values"
     checks.require(np.isfinite(first).any(), "loss", "a finite number", got)
     best = min(found, key=lambda t: t.loss if np.isfinite(t.loss) else np.inf)
-    return best._replace(starts=tuple(found) if len(found) > 1 else ())
+    several = tuple(found) if len(found) > 1 else ()
+    return best._replace(evaluations=pricer.evaluations, starts=several)
 
 
 def _refuse_what_cannot_be_held(

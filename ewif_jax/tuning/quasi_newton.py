@@ -76,11 +76,11 @@ def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked
     ends = np.zeros(len(start), int)
     if not best.is_finite:
         return Ended("not finite", ends)
-    highest, refused, reason = value, False, ""
+    refused, reason = False, ""
     for _ in range(3):
-        best, reason, left = yield from _descended(best, highest, rounding)
+        best, reason, left = yield from _descended(best, rounding)
         refused |= left
-        tolerance = rounding * _scale(best, highest)
+        tolerance = rounding * abs(best.value)
         lower, ends = yield from _looked_around(best, best.point - start, has_ends, tolerance)
         if lower is None:
             break
@@ -89,13 +89,14 @@ def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked
 
 
 def _descended(
-    seen: Seen, highest: float, rounding: float
+    seen: Seen, rounding: float
 ) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[Seen, str, bool]]:
     """The end of one descent, why it ended, and whether a step was refused as not finite."""
-    n, refused, fresh = len(seen.point), False, 0
+    n, refused, fresh, earlier = len(seen.point), False, 0, seen.value
     curvature, radius = np.eye(n) * np.linalg.norm(seen.gradient), 1.0
     while True:
-        tolerance = rounding * _scale(seen, highest)
+        # A least value of 0 is approached in relation to how far it has just fallen.
+        tolerance = rounding * max(abs(seen.value), abs(earlier - seen.value))
         step = shortest(curvature, seen.gradient, radius)
         expected = -seen.gradient @ step - step @ curvature @ step / 2
         if radius < SMALLEST:
@@ -122,7 +123,7 @@ def _descended(
         elif gained > 0.7 and length > 0.8 * radius:
             radius = min(2 * radius, FARTHEST)
         if gained > 0:
-            seen = tried
+            earlier, seen = seen.value, tried
 
 
 def _looked_around(
@@ -180,8 +181,3 @@ def _updated(curvature: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.
     if abs(along) <= 1e-8 * np.linalg.norm(step) * np.linalg.norm(missed):
         return curvature
     return curvature + np.outer(missed, missed) / along
-
-
-def _scale(seen: Seen, highest: float) -> float:
-    """What differences of the loss are compared with: its size, or how far it has fallen."""
-    return max(abs(seen.value), abs(highest - seen.value), np.finfo(float).tiny)

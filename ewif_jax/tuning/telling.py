@@ -20,23 +20,26 @@ def tuned_from(
     names: Sequence[str],
     method: str,
     steps: int,
-    evaluations: int,
 ) -> Tuned:
     """What one descent found."""
-    loss = np.asarray(descent.losses)
-    trails = [np.stack([np.asarray(x) for x in leaf]) for leaf in zip(*descent.trail, strict=True)]
-    held_trails = tuple(np.broadcast_to(x, (len(loss), *np.shape(x))) for x in held)
+    place = descent.chosen if descent.chosen is not None else 0
+    # Histories of one length can be compared and stacked: after the end the best is repeated.
+    order = [*range(len(descent.losses)), *[place] * (steps - len(descent.losses))]
+    loss = np.asarray(descent.losses)[order]
+    trails = [
+        np.stack([np.asarray(x) for x in leaf])[order] for leaf in zip(*descent.trail, strict=True)
+    ]
+    held_trails = tuple(np.broadcast_to(x, (steps, *np.shape(x))) for x in held)
     history = {"loss": loss, "params": objective.params(tuple(trails), held_trails)}
     if descent.validation is not None:
-        history["validation"] = np.asarray(descent.held_out)
-    place = descent.chosen if descent.chosen is not None else 0
+        history["validation"] = np.asarray(descent.held_out)[order]
     params = objective.params(tuple(jnp.asarray(x[place]) for x in trails), held)
     said = ["fixed" if t is None else transform_name(t) for t in domain.transforms]
     transforms = objective.params(tuple(said), ("fixed",) * len(held))
     reason = _reason(descent, domain.notes, names, steps)
     return Tuned(
         params, float(loss[place]), history, reason, descent.lengths[place], transforms, method,
-        evaluations,
+        len(descent.losses),
     )  # fmt: skip
 
 

@@ -16,13 +16,15 @@ class Tuned(NamedTuple):
     loss: () their loss, with the penalty.
     history: of every evaluation, in their order: loss (steps,), and params (steps, ...) where it
         was evaluated; with `validation` also the held-out loss (NaN where it was not asked for).
+        After the end of the search the best is repeated, up to `steps`.
     reason: why it ended. It begins with "converged", "at a bound", "out of steps", "validation" or
         "not finite".
     gradient_norm: the length of the gradient there, in the free numbers (a logarithm for what is
         positive).
     transforms: the name of each leaf's transform, "fixed" if it stood still.
     method: how it was done.
-    evaluations: of the loss and its gradient, of all starts together, also to find the domain.
+    evaluations: how often the loss and its gradient were evaluated: from all starts together, and
+        to find the domain.
     starts: what was found from each starting point, if there were many.
     """
 
