@@ -90,6 +90,12 @@ def test_a_batch_shares_the_mean_of_a_sensor_and_traced_data_cost_the_same():
     np.testing.assert_allclose(jax.jit(loss)(batch), loss(batch), rtol=1e-12)
 
 
+def test_a_loss_first_called_inside_of_a_trace_can_be_called_again():
+    loss = ej.prediction_loss(KALMAN, ej.stream(TIME, VALUE), prior=PRIOR, t0=0.0)
+    jax.eval_shape(lambda: loss(PARAMS))
+    np.testing.assert_allclose(jax.jit(loss)(PARAMS), loss(PARAMS), rtol=1e-12)
+
+
 def test_losing_a_row_is_never_rewarded():
     """Over a gap of 200 tau the next value is predicted well; over one of 2000 tau the information
     is gone, and the row costs more instead of leaving the average."""
