@@ -1,5 +1,6 @@
 """Monte Carlo studies: many simulated runs, measured without keeping the trajectories."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,15 +32,20 @@ RUN_STEPS = 2**20
 
 
 class _Scenario(NamedTuple):
-    simulate: Callable[[Array], Simulation]
+    simulate: Callable[..., Simulation]
     prior: Gaussian | None
     t0: Any
     clock: Clock = "validity"
+    params: Any = None
 
 
 class Scenario(FromRecipe, _Scenario):
     """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
-    start (prior, t0), and the clock of `run`."""
+    start (prior, t0), and the clock of `run`.
+
+    Or simulate(key, params) of parameters of the world, a dict of numbers by name, of which
+    `params` are the defaults: other numbers compile nothing again.
+    """
 
 
 class Statistics(NamedTuple):
@@ -111,7 +117,7 @@ def monte_carlo(
     checks.random_key(key, runs)
     if chunk is None:
         first = key[0] if _one_for_each(key) else key
-        steps = jax.eval_shape(scenario.simulate, first).measurements.value.shape[0]
+        steps = jax.eval_shape(one_run(scenario), first).measurements.value.shape[0]
         parts = -(-runs // min(1024, max(RUN_STEPS // steps, 1)))
         chunk = -(-runs // parts)
     chunk = min(checks.whole("chunk", chunk, 1), runs)
@@ -130,7 +136,7 @@ def monte_carlo(
         # Filled up with repetitions, so that the last chunk is not compiled again.
         index = np.minimum(np.arange(begin, begin + chunk), runs - 1)
         some = jax.tree.map(lambda x, f, i=index: x[i] if f else x, params, marked)
-        keys, own_keys = _keys(key, index)
+        keys, own_keys = run_keys(key, index)
         simulation = simulate_batch(scenario, keys)
         values = scored(
             estimator,
@@ -196,7 +202,7 @@ def _one_for_each(key: RandomKey) -> bool:
 
 
 @jax.jit
-def _keys(key: Array, index: Array) -> tuple[Array, Array]:
+def run_keys(key: Array, index: Array) -> tuple[Array, Array]:
     """For each run one key to simulate it and one to filter it."""
     if _one_for_each(key):
         keys = key[index]
@@ -205,23 +211,73 @@ def _keys(key: Array, index: Array) -> tuple[Array, Array]:
     return keys, jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys)
 
 
-def simulate_batch(scenario: Scenario, keys: Array) -> Simulation:
+def takes_params(scenario: Scenario) -> bool:
+    """Whether it is simulate(key, params)."""
+    if scenario.params is not None:
+        return True
+    try:
+        signature = inspect.signature(scenario.simulate)
+    except (TypeError, ValueError):  # what is written in C tells no arguments
+        return False
+    needed = [
+        x
+        for x in signature.parameters.values()
+        if x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD) and x.default is x.empty
+    ]
+    return len(needed) > 1
+
+
+def one_run(scenario: Scenario) -> Callable[..., Simulation]:
+    """Function (key, params) of one run, whether the scenario takes parameters or not; without
+    params those of the scenario."""
+    with_params = takes_params(scenario)
+
+    def simulate(key: Array, params: Params = scenario.params) -> Simulation:
+        if not with_params:
+            return scenario.simulate(key)
+        expected = "the parameters that its simulate(key, params) reads"
+        checks.require(params is not None, "scenario.params", expected, None)
+        return scenario.simulate(key, params)
+
+    return simulate
+
+
+def simulate_batch(scenario: Scenario, keys: Array, params: Params = None) -> Simulation:
     """One simulation per key, stacked on axis 0; what does not depend on the key stays shared
-    (without that axis), so that filters compute with it once."""
-    flags = dependence(traced(scenario.simulate, keys[0]), True)
+    (without that axis), so that filters compute with it once.
+
+    Args:
+        scenario: where the runs come from.
+        keys: (R,) typed keys.
+        params: of a scenario that takes parameters, in place of its own.
+    """
+    params = scenario.params if params is None else params
+    flags = dependence(traced(one_run(scenario), keys[0], params), (True, _all_false(params)))
     # A scenario of a builder is compiled once for all that are equal; one made by hand may hold
     # arrays, which cannot be compared.
-    source = scenario.simulate if scenario.recipe is None else scenario
-    return _simulate(source, keys, Frozen(flags))
+    source = scenario if scenario.recipe is not None else scenario.simulate
+    return _simulate(source, takes_params(scenario), keys, params, Frozen(flags))
 
 
-@partial(jax.jit, static_argnames=("source", "flags"))
+def _all_false(tree: PyTree) -> Any:
+    return jax.tree.map(lambda _: False, tree)
+
+
+@partial(jax.jit, static_argnames=("source", "with_params", "flags"))
 def _simulate(
-    source: Scenario | Callable[[Array], Simulation], keys: Array, flags: Frozen
+    source: Scenario | Callable[..., Simulation],
+    with_params: bool,
+    keys: Array,
+    params: Params,
+    flags: Frozen,
 ) -> Simulation:
     axes = jax.tree.map(lambda f: 0 if f else None, flags.tree)
     simulate = source.simulate if isinstance(source, Scenario) else source
-    return jax.vmap(simulate, out_axes=axes)(keys)
+
+    def drawn(key: Array) -> Simulation:
+        return simulate(key, params) if with_params else simulate(key)
+
+    return jax.vmap(drawn, out_axes=axes)(keys)
 
 
 def _at_hand(values: dict[str, Array]) -> dict[str, Any]:

@@ -144,12 +144,12 @@ def _all_of(scores: tuple[tuple[str, Score], ...]) -> Observer:
     compiled again."""
 
     def observe(step: Step, seen: tuple[Array, Array]) -> dict[str, Array]:
-        return {name: _score_of(name, score, step, *seen) for name, score in scores}
+        return {name: score_of(name, score, step, *seen) for name, score in scores}
 
     return observe
 
 
-def _score_of(name: str, score: Score, step: Step, truth: Array, mask: Array) -> Array:
+def score_of(name: str, score: Score, step: Step, truth: Array, mask: Array) -> Array:
     """The score, or an error that says what a score is: functions of arrays look like scores."""
     try:
         inspect.signature(score).bind(step, truth, mask)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ewif_jax.lab.timing import timed
 from ewif_jax.study import cli
 from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown
 from ewif_jax.study.shared.folder import Folder
-from ewif_jax.study.shared.timing import timed
 
 
 def finished(out, text, overwrite=False):

@@ -21,10 +21,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from ewif_jax.lab.pieces import Arrays
+from ewif_jax.lab.timing import timed
 from ewif_jax.study.shared.folder import Folder
-from ewif_jax.study.shared.pieces import Arrays
 from ewif_jax.study.shared.refusal import Refused, stop_if_asked
-from ewif_jax.study.shared.timing import timed
 from ewif_jax.types import Numbers
 
 __all__ = ("Experiment", "Measured", "Options", "Refused", "shown")

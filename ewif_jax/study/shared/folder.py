@@ -10,8 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ewif_jax.study.shared import lock, manifest
-from ewif_jax.study.shared.pieces import (
+from ewif_jax.lab import lock
+from ewif_jax.lab.identity import source_fingerprint
+from ewif_jax.lab.pieces import (
     Arrays,
     Broken,
     digest_of,
@@ -20,9 +21,9 @@ from ewif_jax.study.shared.pieces import (
     write_piece,
     write_whole,
 )
+from ewif_jax.study.shared import manifest
 from ewif_jax.study.shared.refusal import Refused, stop_if_asked
 
-PACKAGE = Path(__file__).parents[2]
 PROBE = bytes(1 << 18)
 """what a disk must have room for before any work begins"""
 
@@ -189,12 +190,3 @@ def _remove_if_empty(folder: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
-
-
-def source_fingerprint() -> str:
-    """A digest of the package's source code."""
-    digest = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

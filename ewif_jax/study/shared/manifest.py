@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ewif_jax.study.shared.pieces import Broken, digest_of, read_piece
+from ewif_jax.lab.pieces import Broken, digest_of, read_piece
 
 NAME = "about.json"
 

@@ -9,10 +9,10 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 
 from ewif_jax.estimator import Clock, run
+from ewif_jax.lab.timing import timed
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.study.shared.timing import timed
 from ewif_jax.types import Estimator, Measurement, Numbers, RandomKey, Trace
 
 Observe = Callable[[Trace, Simulation], Mapping[str, Any]]

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from ewif_jax.estimators.extended import extended
+from ewif_jax.lab.timing import timed
 from ewif_jax.monte_carlo import Simulation, simulate_batch
 from ewif_jax.oosm.replay import replay
 from ewif_jax.oosm.selective import selective
@@ -16,7 +17,6 @@ from ewif_jax.scenarios.arrowhead import arrowhead_ekf, arrowhead_ekf_model
 from ewif_jax.study.shared.experiment import Experiment
 from ewif_jax.study.shared.figures import OTHER, canvas, label
 from ewif_jax.study.shared.late import DROPPED, mean_of, rmse, rmses, sweep
-from ewif_jax.study.shared.timing import timed
 
 LIMITS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, math.inf)
 """seconds; delays are whole ones, and what is older than the limit is dropped"""

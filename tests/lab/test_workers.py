@@ -1,0 +1,58 @@
+"""Whoever computes a unit of work, it has the same bits."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ewif_jax as ej
+from lab.test_resume import LINES, SETTING, WORLD
+
+lab = ej.lab
+DEVICES = """
+import sys, numpy as np, jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+import ewif_jax as ej
+from lab.test_resume import LINES, SETTING, WORLD
+assert len(jax.local_devices()) == 2
+ej.lab.compare(LINES, WORLD, **SETTING).to_netcdf(sys.argv[1])
+"""
+
+
+def die(*_):
+    os._exit(1)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return lab.compare(LINES, WORLD, **SETTING).dataset
+
+
+@pytest.mark.slow
+def test_two_processes_and_what_a_dead_one_leaves(whole):
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=spawn) as executor:
+        found = lab.compare(LINES, WORLD, executor=executor, **SETTING)
+        assert found.dataset.equals(whole)
+        executor.submit(die)
+        with pytest.warns(RuntimeWarning, match="a worker died"):
+            found = lab.compare(LINES, WORLD, executor=executor, **SETTING)
+        assert found.dataset.equals(whole)
+
+
+@pytest.mark.slow
+def test_two_devices(whole, tmp_path):
+    import xarray as xr
+
+    subprocess.run([sys.executable, "-c", DEVICES, tmp_path / "found.nc"], check=True,
+                   env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                   cwd=Path(__file__).parents[1])  # fmt: skip
+    found = xr.load_dataset(tmp_path / "found.nc", engine="h5netcdf")
+    for name in whole.data_vars:
+        np.testing.assert_array_equal(found[name], whole[name])
