@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ewif_jax.lab import hosts
 from ewif_jax.lab.comparison import Comparison
 from ewif_jax.lab.design import Design, Limits, designed
-from ewif_jax.lab.engine import Unit, compute_units, not_there
+from ewif_jax.lab.engine import Unit, compute_unit, compute_units, not_there
 from ewif_jax.lab.identity import digest_of, source_fingerprint
 from ewif_jax.lab.methods import Method
 from ewif_jax.lab.moments import PairedMoments, combined, means, paired_moments
@@ -75,7 +76,9 @@ def compare(
         warm_up: seconds from t0 in which rows count for nobody.
         folder: where results are kept, chunk by chunk. The same call goes on where an earlier one
             was stopped, however it was.
-        executor: of the interface `concurrent.futures.Executor`; default: the local devices.
+        executor: of the interface `concurrent.futures.Executor` (processes, Dask's
+            `Client.get_executor()`); default: the local devices. Where `jax.distributed` has
+            several processes, they all make the same call and share the work instead.
         devices: how many local devices, at most.
         chunk: runs in a unit of work; default: all if they are at most 1024 and a million arrivals
             together, else equal parts.
@@ -94,7 +97,8 @@ def compare(
         methods, scenario, over, metrics, limits, runs, most_runs, chunk, key, time, warm_up
     )
     about = _about(design)
-    if folder is None:
+    # Of several processes of one program the first keeps the folder.
+    if folder is None or not hosts.is_first():
         return _filled(design, InMemory(), executor, devices, progress, about)
     store = InFolder(folder, about)
     store.claim(_bytes_needed(design))
@@ -143,6 +147,9 @@ def _compute_all(
         finished += 1
         report.step(finished, len(units))
 
+    if hosts.are_several():
+        hosts.share_units(units, store, lambda unit: compute_unit(design, tuned, unit), keep)
+        return
     compute_units(design, tuned, left, keep, executor, devices)
 
 

@@ -52,12 +52,13 @@ def compute_units(
         _by_executor(design, tuned, units, done, executor)
     elif len(local) == 1 or len(units) == 1:
         for unit in units:
-            done(unit, _compute(design, tuned, unit))
+            done(unit, compute_unit(design, tuned, unit))
     else:
         _by_devices(design, tuned, units, done, local)
 
 
-def _compute(design: Design, tuned: Tuned, unit: Unit) -> Arrays:
+def compute_unit(design: Design, tuned: Tuned, unit: Unit) -> Arrays:
+    """The arrays of a unit, computed here."""
     point = design.points[unit.point]
     return computed(design, point, unit.chunk, tuned.get(unit.point, {}))
 
@@ -73,7 +74,7 @@ def _by_devices(
         device = free.get()
         try:
             with jax.default_device(device):
-                return _compute(design, tuned, unit)
+                return compute_unit(design, tuned, unit)
         finally:
             free.put(device)
 
@@ -94,9 +95,13 @@ def _by_executor(
 ) -> None:
     _refuse_fork(executor)
     workers = getattr(executor, "_max_workers", 32)
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
     if isinstance(executor, Threads):
         found = _as_they_come(
-            executor.submit, lambda unit: _compute(design, tuned, unit), units, IN_FLIGHT * workers
+            executor.submit,
+            lambda unit: compute_unit(design, tuned, unit),
+            units,
+            IN_FLIGHT * workers,
         )
         for unit, arrays in found:
             done(unit, arrays)
@@ -105,7 +110,6 @@ def _by_executor(
 
     key = np.asarray(jax.random.key_data(design.key)) if _is_typed(design.key) else design.key
     implementation = str(jax.random.key_impl(design.key)) if _is_typed(design.key) else None
-    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
     job = cloudpickle.dumps((design._replace(key=key), dict(tuned), implementation, x64))
     left = dict.fromkeys(units)
     try:
@@ -127,7 +131,7 @@ def _by_executor(
             stacklevel=4,
         )
         for unit in left:
-            done(unit, _compute(design, tuned, unit))
+            done(unit, compute_unit(design, tuned, unit))
 
 
 def _as_they_come(
@@ -154,7 +158,7 @@ def remote(job: bytes, unit: tuple[int, int]) -> Arrays:
     """A unit, in a worker."""
     design, tuned, x64 = _unpacked(job)
     with jax.enable_x64(x64):
-        return _compute(design, tuned, Unit(*unit))
+        return compute_unit(design, tuned, Unit(*unit))
 
 
 @lru_cache(maxsize=2)

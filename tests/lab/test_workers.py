@@ -56,3 +56,38 @@ def test_two_devices(whole, tmp_path):
     found = xr.load_dataset(tmp_path / "found.nc", engine="h5netcdf")
     for name in whole.data_vars:
         np.testing.assert_array_equal(found[name], whole[name])
+
+
+HOSTS = """
+import sys, jax
+jax.config.update("jax_enable_x64", True)
+jax.distributed.initialize(f"127.0.0.1:{sys.argv[3]}", 2, int(sys.argv[2]))
+import ewif_jax as ej
+from lab.test_resume import LINES, SETTING, WORLD
+found = ej.lab.compare(LINES, WORLD, folder=sys.argv[1] + "/study", **SETTING)
+found.to_netcdf(f"{sys.argv[1]}/{sys.argv[2]}.nc")
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_of_one_program(whole, tmp_path):
+    import socket
+
+    import xarray as xr
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    for _ in range(2):  # the second time all is there
+        both = [
+            subprocess.Popen(
+                [sys.executable, "-c", HOSTS, tmp_path, str(k), str(port)], env=environment
+            )
+            for k in range(2)
+        ]
+        assert [process.wait(300) for process in both] == [0, 0]
+        for k in range(2):
+            found = xr.load_dataset(tmp_path / f"{k}.nc", engine="h5netcdf")
+            for name in whole.data_vars:
+                np.testing.assert_array_equal(found[name], whole[name])

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ewif_jax.lab.plane import to_degrees
 from ewif_jax.study.cli import run
 from ewif_jax.study.track.loss import smooth_median
 from ewif_jax.study.track.readings import read
-from ewif_jax.study.track.tracks import batch, degrees
+from ewif_jax.study.track.tracks import batch
 
 PLANES = Path(__file__).parents[3] / "shared" / "data" / "opensky_plane_states.csv"
 
@@ -123,7 +124,7 @@ def test_degrees_become_metres_and_back():
     north = 111_260 * 0.01
     assert metres[0] == pytest.approx([0, 0])
     assert metres[1] == pytest.approx([-1372, north], rel=5e-3)
-    np.testing.assert_allclose(degrees(tracks.origin[0], metres), path_like, atol=1e-9)
+    np.testing.assert_allclose(to_degrees(metres, tracks.origin[0]), path_like, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ import pandas as pd
 import xarray as xr
 
 from ewif_jax.fast.compiling import array
+from ewif_jax.lab.plane import to_degrees
 from ewif_jax.study.shared.experiment import Experiment, Options
 from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track import figures as track_figures
 from ewif_jax.study.track.loss import filtered, loss, report
 from ewif_jax.study.track.method import Method, method
 from ewif_jax.study.track.readings import Readings, read
-from ewif_jax.study.track.tracks import Tracks, batch, degrees
+from ewif_jax.study.track.tracks import Tracks, batch
 from ewif_jax.tuning import tune
 from ewif_jax.types import Measurement, Status
 
@@ -182,7 +183,7 @@ def _save(
     if tracks.origin is not None:
         cuts = np.searchsorted(row, np.arange(1, len(tracks.name)))
         means = np.split(found["mean"][:, :2], cuts)
-        place = [degrees(o, m) for o, m in zip(tracks.origin, means, strict=True)]
+        place = [to_degrees(m, o) for o, m in zip(tracks.origin, means, strict=True)]
         frame |= dict(zip(readings.columns.values, np.concatenate(place).T, strict=True))
     frame |= {
         "prediction_error": found["error"],

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from ewif_jax.lab.plane import to_degrees
 from ewif_jax.study.shared.figures import (
     EWIF,
     KALMAN,
@@ -16,7 +17,7 @@ from ewif_jax.study.shared.figures import (
     legend_above,
     plain_ticks,
 )
-from ewif_jax.study.track.tracks import Tracks, degrees
+from ewif_jax.study.track.tracks import Tracks
 
 MOST = 200
 """Tracks drawn at most."""
@@ -95,7 +96,7 @@ def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
 def _place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     here = found.row == row
     if found.origin is not None:
-        where = degrees(found.origin[row], mean[here, :2])
+        where = to_degrees(mean[here, :2], found.origin[row])
         return where[:, 1], where[:, 0]
     if found.value.shape[-1] == 1:
         return found.time[here], mean[here, 0]

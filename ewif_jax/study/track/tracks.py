@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import pyproj
 
+from ewif_jax.lab.plane import to_plane
 from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track.readings import Readings
 from ewif_jax.types import Measurement
@@ -167,22 +167,9 @@ def _like_lengths(size: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def degrees(origin: np.ndarray, metres: np.ndarray) -> np.ndarray:
-    """Latitude and longitude (N, 2) of positions (N, 2), east and north of an origin."""
-    longitude, latitude = _plane(origin)(metres[:, 0], metres[:, 1], inverse=True)
-    return np.column_stack([latitude, longitude])
-
-
 def _local(value: np.ndarray, geographic: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Metres east and north of the first position (azimuthal equidistant), and that position."""
-    if not geographic:
-        return value, value[0]
-    east, north = _plane(value[0])(value[:, 1], value[:, 0])
-    return np.column_stack([east, north]), value[0]
-
-
-def _plane(origin: np.ndarray) -> pyproj.Proj:
-    return pyproj.Proj(proj="aeqd", lat_0=origin[0], lon_0=origin[1], ellps="WGS84")
+    """Metres east and north of the first position, and that position."""
+    return (to_plane(value, value[0]) if geographic else value), value[0]
 
 
 def _padded(rows: list[np.ndarray], fill: float | bool | None = None) -> np.ndarray:
