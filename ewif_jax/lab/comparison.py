@@ -90,19 +90,20 @@ class Comparison:
             found.append(total)
         return found
 
-    def table(self, reference: str | None = None) -> pd.DataFrame:
+    def table(self, reference: str | None = None, *, details: bool = False) -> pd.DataFrame:
         """One row for each point, metric and method.
 
         value, error: the mean over runs, or for a squared error its root (`kind` says which), and
         its standard error; difference, difference_error: minus `reference` on the same runs, with
         the standard error of the joint scatter (paired); rank: 1 is the smallest value; without:
         rows (per run) without an estimate, in which the prior stands in; missing: rows (per run)
-        that have no score for another reason; runs. With limits: converged, converged_error: mean
-        time to converge of the runs that did; not_converged, lost: shares of runs. Then the shares
-        of measurements with each `Status`.
+        that have no score; runs. With limits: converged, converged_error: mean time to converge of
+        the runs that did; not_converged, lost: shares of runs.
 
         Args:
             reference: name of a method.
+            details: also the last row's value (`final`), and the shares of measurements with each
+                `Status`.
 
         Raises:
             ValueError: no method of that name.
@@ -112,8 +113,13 @@ class Comparison:
         for number, point in enumerate(self.points):
             for name in self.design.metrics:
                 found, total = self._moments[number], self._totals[number]
-                rows += tables.rows(self.design, point, name, found, total, reference)
+                rows += tables.rows(self.design, point, name, found, total, reference, details)
         return pd.DataFrame(rows)
+
+    def summary(self, reference: str | None = None, *, details: bool = False) -> str:
+        """`table` as text for people: a value and its error in one cell, and no column that says
+        nothing."""
+        return tables.text(self, reference, details)
 
     def _require_method(self, argument: str, name: str | None) -> None:
         expected = f"one of the methods {', '.join(self.methods)}"
@@ -235,7 +241,7 @@ class Comparison:
         return place
 
     def __repr__(self) -> str:
-        return tables.text(self)
+        return self.summary()
 
     def _repr_html_(self) -> str:
         return tables.html(self)

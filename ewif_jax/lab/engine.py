@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ewif_jax import checks
 from ewif_jax.lab.design import Design
 from ewif_jax.lab.store import Store
 from ewif_jax.lab.units import Arrays, computed
@@ -108,8 +109,14 @@ def _by_executor(
         return
     import cloudpickle
 
-    key = np.asarray(jax.random.key_data(design.key)) if _is_typed(design.key) else design.key
-    implementation = str(jax.random.key_impl(design.key)) if _is_typed(design.key) else None
+    key = (
+        np.asarray(jax.random.key_data(design.key))
+        if checks.is_typed_key(design.key)
+        else design.key
+    )
+    implementation = (
+        str(jax.random.key_impl(design.key)) if checks.is_typed_key(design.key) else None
+    )
     job = cloudpickle.dumps((design._replace(key=key), dict(tuned), implementation, x64))
     left = dict.fromkeys(units)
     try:
@@ -171,10 +178,6 @@ def _unpacked(job: bytes) -> tuple[Design, Tuned, bool]:
         key = jax.random.wrap_key_data(design.key, impl=implementation)
         design = design._replace(key=key)
     return design, tuned, x64
-
-
-def _is_typed(key: Any) -> bool:
-    return isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
 
 
 def _refuse_fork(executor: Executor) -> None:

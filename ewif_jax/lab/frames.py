@@ -96,7 +96,7 @@ def from_frame(
     dropped: dict[str, int] = {}
     kept = np.ones(len(values), bool)
 
-    def drop(reason: str, bad: np.ndarray) -> None:
+    def drop(reason: str, bad: Any) -> None:
         nonlocal kept
         count = int((kept & bad).sum())
         if count:

@@ -71,13 +71,15 @@ class Method(_Method):
 
     def told_by(self, scenario: Scenario) -> Told:
         """What this method is told in a scenario."""
-        own = self.prior, self.t0, self.clock
-        world = scenario.prior, scenario.t0, scenario.clock
-        return Told(*(w if _is_scenario(x) else x for x, w in zip(own, world, strict=True)))
 
+        def chosen(own: Any, of_scenario: Any) -> Any:
+            return of_scenario if isinstance(own, str) and own == SCENARIO else own
 
-def _is_scenario(x: object) -> bool:
-    return isinstance(x, str) and x == SCENARIO
+        return Told(
+            chosen(self.prior, scenario.prior),
+            chosen(self.t0, scenario.t0),
+            chosen(self.clock, scenario.clock),
+        )
 
 
 def as_methods(methods: Any) -> dict[str, Method]:

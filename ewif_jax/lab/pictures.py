@@ -103,7 +103,8 @@ def _against_time(
         ax.plot(time, value[k], label=name, markersize=4, linewidth=1.4, **options)
         low, high = value[k] - ERRORS * errors[k], value[k] + ERRORS * errors[k]
         ax.fill_between(time, low, high, color=look.color, alpha=0.15, linewidth=0)
-    style.robust_limits(ax, value)
+    band = ERRORS * np.nan_to_num(errors)
+    style.robust_limits(ax, np.stack([value - band, value + band]))
 
 
 def pareto_figure(
@@ -132,8 +133,8 @@ def pareto_figure(
     best = front(spent, value)
     ax.plot(spent[best], value[best], color="#555555", linewidth=0.8, zorder=0)
     ax.set_xscale("log")
-    if spent.max() < 10 * spent.min():
-        ax.set_xlim(spent.min() / 2, spent.max() * 3)
+    ax.set_xlim(spent.min() / 2, spent.max() * 3)  # room for the names
+    style.plain_log_ticks(ax)
     units = {"seconds": "seconds per arrival and run, filtering only", "numbers": "numbers stored"}
     point = ", ".join(f"{name} = {x:g}" for name, x in comparison.points[number].items())
     style.label(ax, units[cost], _name(comparison, metric, None), point)

@@ -1,5 +1,6 @@
 """Pictures of what a filter made of a series."""
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
@@ -41,7 +42,7 @@ def track(
     ax = style.own_axes(ax, 6.5, 6.0)
     x, y = axes
     if measurements is not None:
-        seen = np.asarray(measurements.mask)[:, :2].all(1)
+        seen = np.all(np.asarray(measurements.mask)[:, :2], axis=1)
         value = np.where(seen[:, None], np.asarray(measurements.value)[:, :2], np.nan)
         _by_status(ax, value[:, 0], value[:, 1], np.asarray(trace.info.status))
     if truth is not None:
@@ -57,8 +58,10 @@ def track(
         place = (float(mean[k, x]), float(mean[k, y]))
         ax.add_patch(Ellipse(place, width, height, angle=angle, color=ESTIMATE, alpha=0.2, lw=0))
     scaled = "" if factor == 1 else f", standard deviations times {factor:.2g}"
-    ax.plot([], [], color=ESTIMATE, alpha=0.3, linewidth=8, label=f"{probability:.0%}{scaled}")
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.plot(
+        [], [], color=ESTIMATE, alpha=0.3, linewidth=8, label=f"{probability:.0%} ellipse{scaled}"
+    )
+    ax.set_aspect("equal", adjustable="box")
     style.label(ax, f"component {x}", f"component {y}")
     style.legend_above(ax)
     return ax
@@ -105,7 +108,7 @@ def component(
     ax.fill_between(
         time, middle - spread, middle + spread, color=ESTIMATE, alpha=0.2, linewidth=0, label=text
     )
-    shown = [middle]
+    shown = [middle - spread, middle + spread]
     if measurements is not None:
         seen = np.asarray(measurements.mask)[:, index]
         value = np.where(seen, np.asarray(measurements.value)[:, index], np.nan)
@@ -119,7 +122,7 @@ def component(
         shown.append(true)
     style.robust_limits(ax, np.concatenate(shown))
     style.label(ax, "time [s]", name or f"component {index}")
-    style.legend_above(ax, 3)
+    style.legend_above(ax, 2)
     return ax
 
 
@@ -158,7 +161,7 @@ def consistency(
     time = np.asarray(trace.time)
     time = time if time.ndim == 1 else time.mean(0)
     low, high = chi2_band(k, runs, level)
-    text = f"χ²({k}) over {runs} runs, {level:.0%}"
+    text = f"χ²({k}) over {runs} run{'s' * (runs > 1)}, {level:.0%}"
     ax.axhspan(low, high, color=style.BAND, alpha=0.25, linewidth=0, label=text)
     ax.plot(time, average, color=ESTIMATE, linewidth=1.3, label="NEES")
     style.robust_limits(ax, average, floor=0.0)
@@ -221,7 +224,7 @@ def _nees_of(trace: Trace, truth: Numbers) -> tuple[np.ndarray, int]:
     """NEES (T,) or (R, T) of the first k components, and k."""
     true = np.asarray(truth)
     k = true.shape[-1]
-    true = np.broadcast_to(true, (*np.shape(trace.mean)[:-1], k))
+    true = jnp.asarray(np.broadcast_to(true, (*np.shape(trace.mean)[:-1], k)))
     return np.asarray(nees(trace.mean, trace.cov, true)), k
 
 

@@ -43,7 +43,7 @@ document.querySelectorAll("table.sortable th").forEach(function(th){
 def page(comparison: "Comparison", reference: str, title: str) -> str:
     """The whole page."""
     title = title or "Comparison of " + ", ".join(comparison.methods)
-    table = comparison.table(reference)
+    table = comparison.table(reference, details=True)
     parts = [f"<h1>{escape(title)}</h1>", f"<p>{escape(tables._head(comparison))}</p>"]
     for metric in comparison.design.metrics:
         own = table[table["metric"] == metric]

@@ -68,18 +68,14 @@ def _described(state: State) -> dict[str, str]:
 
 
 def _dtype(x: Any) -> str:
-    return str(jax.numpy.result_type(x)) if not _is_key(x) else str(x.dtype)
+    return str(jax.numpy.result_type(x)) if not checks.is_typed_key(x) else str(x.dtype)
 
 
 def _plain(x: Any) -> np.ndarray:
-    return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
+    return np.asarray(jax.random.key_data(x) if checks.is_typed_key(x) else x)
 
 
 def _as_in(like: Any, x: np.ndarray) -> Any:
-    if _is_key(like):
+    if checks.is_typed_key(like):
         return jax.random.wrap_key_data(jax.numpy.asarray(x), impl=jax.random.key_impl(like))
     return jax.numpy.asarray(x, jax.numpy.result_type(like))
-
-
-def _is_key(x: Any) -> bool:
-    return isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)

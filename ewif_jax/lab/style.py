@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 TRUTH, MEASURED, ESTIMATE, BAND = "#000000", "#8c96a0", "#0072b2", "#56b4e9"
 """What is true is black in every picture."""
@@ -69,6 +70,14 @@ def label(ax: Axes, x: str, y: str, title: str = "") -> None:
     ax.set_ylabel(y)
     if title:
         ax.set_title(title, loc="left", fontsize="medium")
+
+
+def plain_log_ticks(ax: Axes) -> None:
+    """Ticks 1, 2, 5, 10, ... of a logarithmic x axis, written without powers of ten where they are
+    of middling size."""
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 def legend_above(ax: Axes, columns: int = 4) -> None:

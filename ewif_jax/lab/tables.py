@@ -44,6 +44,7 @@ def rows(
     found: Mapping[str, PairedMoments],
     total: Mapping[str, Any],
     reference: str | None,
+    details: bool,
 ) -> list[dict[str, Any]]:
     """The rows of `Comparison.table` of one point and metric."""
     names, root = list(design.methods), metric in design.roots
@@ -55,7 +56,8 @@ def rows(
         columns |= {"difference": apart[0], "difference_error": apart[1]}
     order = pd.Series(value).rank(method="min")
     columns |= {"rank": order.astype("Int64").to_numpy(object)}
-    columns |= {"final": final, "final_error": final_error}
+    if details:
+        columns |= {"final": final, "final_error": final_error}
     if f"times/{metric}" in total:
         columns |= _convergence(total[f"times/{metric}"], int(total["runs"]))
     if f"lost/{metric}" in total:
@@ -64,8 +66,9 @@ def rows(
     # What has no estimate and no stand-in has no score either: it is told once.
     columns |= {"missing": total[f"missing/{metric}"] / total["runs"]}
     columns |= {"runs": np.full(len(names), int(total["runs"]))}
-    shares = total["status"] / np.maximum(total["status"].sum(1, keepdims=True), 1)
-    columns |= {status.name.lower(): shares[:, status] for status in Status}
+    if details:
+        shares = total["status"] / np.maximum(total["status"].sum(1, keepdims=True), 1)
+        columns |= {status.name.lower(): shares[:, status] for status in Status}
     head = {**point, "metric": metric, "kind": "root mean" if root else "mean"}
     return [
         {**head, "method": name, **{column: x[k] for column, x in columns.items()}}
@@ -175,15 +178,18 @@ def for_people(table: pd.DataFrame) -> pd.DataFrame:
             pairs = zip(found[name], found.pop(error), strict=True)
             found[name] = [shown(*pair) for pair in pairs]
     counted = ["without", "missing", *(status.name.lower() for status in Status)]
+    counted = [name for name in counted if name in found]
     dull = [name for name in counted if not np.any(found[name].to_numpy())]
+    for name in set(counted) - set(dull):
+        found[name] = [f"{x:.3g}" for x in found[name]]
     dull += [name for name in ("metric", "kind") if len(set(found[name])) == 1]
     found = found.drop(columns=dull)
     return found.rename(columns=lambda c: c.replace("_", " "))
 
 
-def text(comparison: "Comparison") -> str:
+def text(comparison: "Comparison", reference: str | None, details: bool) -> str:
     """The table as text, under a line that says what it is."""
-    table = for_people(comparison.table())
+    table = for_people(comparison.table(reference, details=details))
     return f"{_head(comparison)}\n{table.to_string(index=False)}"
 
 

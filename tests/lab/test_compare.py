@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ewif_jax as ej
-from lab.world import KEY, METRICS, MODEL, OVER, PRIOR, STEPS, WORLD, methods, simulate
+from lab.world import EWIF, KEY, METRICS, MODEL, OVER, PRIOR, STEPS, WORLD, methods, simulate
 
 lab = ej.lab
 RUNS = 30
@@ -38,7 +38,7 @@ def test_it_is_monte_carlo_at_each_point(found):
 
 
 def test_the_table_says_means_errors_and_paired_differences(found):
-    table = found.table(reference="drop").set_index(["delay", "q", "method"])
+    table = found.table(reference="drop", details=True).set_index(["delay", "q", "method"])
     squares = found.dataset["position"]
     for (delay, q, method), row in table.iterrows():
         own, other = (
@@ -72,7 +72,9 @@ def test_other_methods_chunks_and_workers_do_not_show(found):
     np.testing.assert_allclose(
         other.dataset["position"].sel({"method": "drop"}), same, rtol=1e-12, atol=1e-15
     )
-    np.testing.assert_array_equal(other.table()["used"], alone.table()["used"])
+    np.testing.assert_array_equal(
+        other.status_shares(3)["late_used"], alone.status_shares(3)["late_used"]
+    )
 
 
 def test_numbers_compile_nothing_again(found):
@@ -155,10 +157,10 @@ def test_limits_say_when_runs_converge_and_which_are_lost(found):
 
 def test_a_method_is_tuned_on_runs_of_its_own():
     tuned = lab.Method(
-        ej.ewif(STILL_TAU, tau=lambda p: p["tau"]), {"tau": 0.3}, prior=None,
+        EWIF, {"tau": 0.3}, prior=None,
         tune=lab.Tuning(runs=4, steps=5),
     )  # fmt: skip
-    fixed = lab.Method(ej.ewif(STILL_TAU, tau=lambda p: p["tau"]), {"tau": 0.3}, prior=None)
+    fixed = lab.Method(EWIF, {"tau": 0.3}, prior=None)
     found = lab.compare({"tuned": tuned, "fixed": fixed}, WORLD, runs=4, key=KEY)
     (row,) = found.tuned.to_dict("records")
     assert row["method"] == "tuned"
@@ -171,8 +173,6 @@ def test_a_method_is_tuned_on_runs_of_its_own():
         other.dataset["squared_error"].sel({"method": "fixed"}),
     )
 
-
-STILL_TAU = ej.models.random_walk(sensors=ej.models.position_sensor(1.0), q=0.0)
 
 REFUSED = {
     "an axis that nobody uses": ({"over": {"speed": [1.0]}}, r"over\['speed'\].*nobody uses"),

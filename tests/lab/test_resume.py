@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -147,7 +148,8 @@ def test_two_processes_do_not_share_a_folder(tmp_path):
 
 
 def test_a_disk_that_is_full_or_read_only_is_found_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("ewif_jax.lab.store.shutil.disk_usage", lambda _: (10, 10, 100))
+    little = SimpleNamespace(free=100)
+    monkeypatch.setattr("ewif_jax.lab.store.shutil.disk_usage", lambda _: little)
     with pytest.raises(OSError, match="are free") as caught:
         lab.compare(LINES, WORLD, folder=tmp_path / "full", **SETTING)
     assert caught.value.filename == str(tmp_path / "full")

@@ -12,6 +12,7 @@ PRIOR = ej.Gaussian(np.zeros(1), 4.0 * np.eye(1))
 KEY = jax.random.key(3)
 MODEL = ej.models.random_walk(sensors=ej.models.position_sensor(1.0), q=lambda p: p["q"])
 STILL = ej.models.random_walk(sensors=ej.models.position_sensor(1.0), q=0.0)
+EWIF = ej.ewif(STILL, tau=lambda p: p["tau"])
 METRICS = {"position": ej.scores.squared_error}
 
 
@@ -34,5 +35,5 @@ def methods():
     return {
         "drop": lab.Method(ej.drop_late(ej.kalman(MODEL)), follows),
         "Al1": lab.Method(ej.al1(MODEL, lag=6), follows),
-        "EWIF": lab.Method(ej.ewif(STILL, tau=lambda p: p["tau"]), {"tau": 2.0}, prior=None),
+        "EWIF": lab.Method(EWIF, {"tau": 2.0}, prior=None),
     }
