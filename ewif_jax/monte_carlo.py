@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import checks
+from ewif_jax import checks, shown
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.dependence import dependence, traced
 from ewif_jax.fast.layout import Frozen, broadcast_prefix
+from ewif_jax.moments import Moments, combined, shifted, standard_error
 from ewif_jax.recipe import FromRecipe
 from ewif_jax.scores import Score, average, scored, squared_error
 from ewif_jax.types import Estimator, Gaussian, Measurement, Params, PyTree, RandomKey
@@ -60,6 +61,23 @@ class Statistics(NamedTuple):
     per_step: dict[str, np.ndarray]
     per_step_se: dict[str, np.ndarray]
     missing: dict[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        return shown.as_text(self._lines())
+
+    def _repr_html_(self) -> str:
+        return shown.as_html(self._lines())
+
+    def _lines(self) -> dict[str, str]:
+        runs = max((len(x) for x in self.per_run.values()), default=0)
+        lines = {"Statistics": f"{runs} runs; mean ± standard error, and the root of the mean"}
+        for name in self.per_run:
+            value, error = self.mean(name)
+            text = f"{value:.5g} ± {error:.2g}"
+            text += f", root {self.root(name)[0]:.5g}" if value >= 0 else ""
+            left_out = int(np.sum(self.missing[name]))
+            lines[name] = text + (f" ({left_out} arrivals left out)" if left_out else "")
+        return lines
 
     def mean(self, name: str) -> tuple[float, float]:
         """The metric's average over runs, and its standard error."""
@@ -130,7 +148,7 @@ def monte_carlo(
             )
     per_run: list[dict[str, np.ndarray]] = []
     missing: list[dict[str, np.ndarray]] = []
-    moments: dict[str, _Moments] = {}
+    moments: dict[str, Moments] = {}
     for begin in range(0, runs, chunk):
         count = min(chunk, runs - begin)
         # Filled up with repetitions, so that the last chunk is not compiled again.
@@ -157,43 +175,13 @@ def monte_carlo(
         per_run.append(runwise)
         missing.append(absent)
         for name, parts in found.items():
-            added = _shifted(*(np.asarray(x, float) for x in parts))
-            moments[name] = _combined(moments[name], added) if name in moments else added
+            added = shifted(*(np.asarray(x, float) for x in parts))
+            moments[name] = combined(moments[name], added) if name in moments else added
         if progress is not None:
             progress(begin + count, runs)
     per_step = {name: found.mean for name, found in moments.items()}
-    errors = {name: _standard_error(found) for name, found in moments.items()}
+    errors = {name: standard_error(found) for name, found in moments.items()}
     return Statistics(_join(per_run), per_step, errors, _join(missing))
-
-
-class _Moments(NamedTuple):
-    """How many values there are at each step (T,), their mean, and the sum of the squares of what
-    they differ from it."""
-
-    count: np.ndarray
-    mean: np.ndarray
-    squares: np.ndarray
-
-
-def _combined(some: _Moments, others: _Moments) -> _Moments:
-    """The moments of both (Chan, Golub and LeVeque 1979): no squares of large numbers, whose
-    difference would be lost in rounding."""
-    count = some.count + others.count
-    safe = np.maximum(count, 1)
-    with np.errstate(invalid="ignore"):
-        apart = others.mean - some.mean
-        means = (some.count, some.mean), (others.count, others.mean)
-        mean = sum(np.where(n > 0, n * x, 0) for n, x in means) / safe
-        between = np.where(some.count * others.count > 0, apart**2, 0)
-        squares = some.squares + others.squares + between * some.count * others.count / safe
-    return _Moments(count, np.where(count > 0, mean, np.nan), squares)
-
-
-def _standard_error(found: _Moments) -> np.ndarray:
-    """Of the mean at each step (T,); NaN with fewer than two values."""
-    count = found.count
-    safe = np.maximum(count - 1, 1) * np.maximum(count, 1)
-    return np.where(count > 1, np.sqrt(found.squares / safe), np.nan)
 
 
 def _one_for_each(key: RandomKey) -> bool:
@@ -289,29 +277,19 @@ def _at_hand(values: dict[str, Array]) -> dict[str, Any]:
 @jax.jit
 def _summarise(values: dict[str, Array]) -> tuple[dict, dict, dict]:
     """For each metric (R, T): its average over each run, how many values were left out, and of
-    each step the sums that `_shifted` reads."""
+    each step the sums that `shifted` reads."""
     is_score = jax.tree.map(lambda x: ~jnp.isnan(x), values)
     runwise = jax.tree.map(lambda x: average(x, 1), values)
     absent = jax.tree.map(lambda k: jnp.sum(~k, 1), is_score)
-    return runwise, absent, jax.tree.map(_sums, values, is_score)
+    return runwise, absent, jax.tree.map(step_sums, values, is_score)
 
 
-def _sums(values: Array, is_score: Array) -> tuple[Array, Array, Array, Array]:
+def step_sums(values: Array, is_score: Array) -> tuple[Array, Array, Array, Array]:
     """Of each step (T,): the count, the mean, and the sum and square sum of the distances from it
     (the mean is rounded, so the first is not quite 0)."""
     count, mean = jnp.sum(is_score, 0), average(values, 0)
     apart = jnp.where(is_score, values - mean[None], 0)
     return count, mean, jnp.sum(apart, 0), jnp.sum(jnp.square(apart), 0)
-
-
-def _shifted(count: Any, mean: Any, total: Any, square: Any) -> _Moments:
-    """The moments, from sums of distances from a rounded mean."""
-    safe = np.maximum(count, 1)
-    return _Moments(
-        count,
-        np.where(np.isfinite(total), mean + total / safe, mean),
-        np.maximum(square - total**2 / safe, 0),
-    )
 
 
 def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
+from ewif_jax import shown
 from ewif_jax.recipe import FromRecipe
 
 Params = Any
@@ -37,6 +38,14 @@ class Measurement(NamedTuple):
     value: Array
     sensor: Array
     mask: Array
+
+    def __repr__(self) -> str:
+        lines = shown.stream_lines("Measurement", *self)
+        return tuple.__repr__(self) if lines is None else shown.as_text(lines)
+
+    def _repr_html_(self) -> str | None:
+        lines = shown.stream_lines("Measurement", *self)
+        return None if lines is None else shown.as_html(lines)
 
 
 class Gaussian(NamedTuple):
@@ -156,3 +165,15 @@ class Trace(NamedTuple):
     info: Info
     final_state: Any
     recorded: Any = None
+
+    def __repr__(self) -> str:
+        lines = self._lines()
+        return tuple.__repr__(self) if lines is None else shown.as_text(lines)
+
+    def _repr_html_(self) -> str | None:
+        lines = self._lines()
+        return None if lines is None else shown.as_html(lines)
+
+    def _lines(self) -> dict[str, str] | None:
+        status = getattr(self.info, "status", None)
+        return shown.trace_lines(self.time, self.mean, self.cov, status, Status)

@@ -13,8 +13,11 @@ from ewif_jax import checks
 from ewif_jax.lab import moments, tables
 from ewif_jax.lab.design import Design
 from ewif_jax.lab.engine import Tuned, Unit
-from ewif_jax.lab.moments import PairedMoments, StepMoments
+from ewif_jax.lab.moments import PairedMoments
 from ewif_jax.lab.store import Store
+from ewif_jax.lab.units import STEP_SUMS
+from ewif_jax.moments import Moments, shifted
+from ewif_jax.moments import combined as combined_steps
 from ewif_jax.types import Status
 
 if TYPE_CHECKING:
@@ -156,7 +159,7 @@ class Comparison:
         return tables.dataset(self)
 
     @cached_property
-    def over_time(self) -> dict[str, list[StepMoments]]:
+    def over_time(self) -> dict[str, list[Moments]]:
         """By metric, of every point the averages over runs of each step.
 
         Raises:
@@ -164,13 +167,13 @@ class Comparison:
         """
         remedy = "a comparison that kept them, compare(..., time=True)"
         checks.require(self.design.over_time, "time", remedy, "time=False")
-        found: dict[str, list[StepMoments]] = {}
+        found: dict[str, list[Moments]] = {}
         for name in self.design.metrics:
-            keys = [f"{kind}/{name}" for kind in ("count", "mean", "squares")]
+            keys = [f"{kind}/{name}" for kind in STEP_SUMS]
             found[name] = [
                 reduce(
-                    moments.combined_steps,
-                    (StepMoments(*(x[k].astype(float) for k in keys)) for x in self.units(point)),
+                    combined_steps,
+                    (shifted(*(x[k].astype(float) for k in keys)) for x in self.units(point)),
                 )
                 for point in range(len(self.points))
             ]

@@ -136,7 +136,8 @@ def designed(
     if chunk is None:
         parts = -(-count // min(1024, max(RUN_STEPS // steps, 1)))
         chunk = -(-count // parts) if until is None else min(1024, max(RUN_STEPS // steps, 2))
-    chunk = min(checks.whole("chunk", chunk, 1), count)
+    # A chunk that was asked for stays as it is: with fewer runs it is the same program.
+    chunk = checks.whole("chunk", chunk, 1)
     return Design(
         named,
         scenario,
@@ -172,7 +173,7 @@ def _size(runs: int | str, most_runs: int | None) -> tuple[int, float | None]:
 
 
 def _numbers(name: str, values: Any) -> tuple[float, ...]:
-    where, expected = f"over[{name!r}]", "a list of different finite numbers"
+    where, expected = f"over[{name!r}]", "a list of different numbers"
     checks.require(isinstance(name, str), "over", "names of axes", repr(name))
     taken = name not in ("method", "run", "step", "status", "metric")
     checks.require(taken, "over", "a name that no other dimension has", repr(name))
@@ -180,7 +181,7 @@ def _numbers(name: str, values: Any) -> tuple[float, ...]:
     is_list = array.ndim == 1 and array.size > 0 and array.dtype.kind in "iuf"
     remedy = f"{expected} (what is no number is a Method or a comparison of its own)"
     checks.require(is_list, where, remedy, repr(values))
-    good = np.isfinite(array).all() and np.unique(array).size == array.size
+    good = not np.isnan(array).any() and np.unique(array).size == array.size
     checks.require(good, where, expected, repr(values))
     return tuple(float(x) for x in array)
 

@@ -78,31 +78,3 @@ def differences(found: PairedMoments, reference: int, root: bool) -> tuple[np.nd
         error = np.sqrt(np.maximum(spread, 0) / (count * (count - 1)))
         value = np.where(count > 0, own - other, np.nan)
     return value, np.where(np.isfinite(value) & (count > 1), error, np.nan)
-
-
-class StepMoments(NamedTuple):
-    """Of each step (M, T): how many scores, their mean, and the squares about it."""
-
-    count: np.ndarray
-    mean: np.ndarray
-    squares: np.ndarray
-
-
-def combined_steps(some: StepMoments, others: StepMoments) -> StepMoments:
-    """Of both sets of runs."""
-    count = some.count + others.count
-    safe = np.maximum(count, 1)
-    with np.errstate(invalid="ignore", over="ignore"):
-        weight = some.count * others.count / safe
-        between = np.where(weight > 0, (others.mean - some.mean) ** 2 * weight, 0.0)
-        parts = (some.count, some.mean), (others.count, others.mean)
-        mean = sum(np.where(n > 0, n * x, 0.0) for n, x in parts) / safe
-    mean = np.where(count > 0, mean, np.nan)
-    return StepMoments(count, mean, some.squares + others.squares + between)
-
-
-def step_errors(found: StepMoments) -> np.ndarray:
-    """Standard errors (M, T) of the means; NaN from fewer than two runs."""
-    count = found.count.astype(float)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count > 1, np.sqrt(found.squares / (count * (count - 1))), np.nan)

@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.storage import storage
 from ewif_jax.lab import methods as lines
 from ewif_jax.lab import moments, style
+from ewif_jax.moments import standard_error
 
 if TYPE_CHECKING:
     from ewif_jax.lab.comparison import Comparison
@@ -91,7 +92,7 @@ def _against_time(
 ) -> None:
     checks.require(reference is None, "reference", "None against time", repr(reference))
     found = comparison.over_time[metric][number]
-    time, errors = comparison.times(number), moments.step_errors(found)
+    time, errors = comparison.times(number), standard_error(found)
     root = metric in comparison.design.roots
     mean = found.mean
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -12,6 +12,7 @@ import xarray as xr
 from ewif_jax.lab import moments
 from ewif_jax.lab.design import Design
 from ewif_jax.lab.moments import PairedMoments
+from ewif_jax.moments import standard_error
 from ewif_jax.types import Status
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def dataset(comparison: "Comparison") -> xr.Dataset:
             steps = comparison.over_time[name]
             over = f"{name}_over_time"
             variables[over] = gridded([x.mean for x in steps], ("method", "step"))
-            errors = [moments.step_errors(x) for x in steps]
+            errors = [standard_error(x) for x in steps]
             variables[f"{over}_se"] = gridded(errors, ("method", "step"))
     points = range(len(comparison.points))
     if design.over_time:

@@ -13,7 +13,7 @@ from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.lab import methods as lines
 from ewif_jax.lab.design import Design
 from ewif_jax.lab.timing import timed
-from ewif_jax.monte_carlo import Simulation, run_keys, simulate_batch
+from ewif_jax.monte_carlo import Simulation, run_keys, simulate_batch, step_sums
 from ewif_jax.scores import Score, average, score_of
 from ewif_jax.streams import float_dtype
 from ewif_jax.types import Gaussian, Params, Status
@@ -38,7 +38,7 @@ def computed(
 
     By metric: `score/name` (M, R) averages over the rows that count, `final/name` (M, R) of the
     last row, `missing/name` (M,) rows that count and have no score; with limits `converged/name`
-    (M, R) seconds and `lost/name` (M, R); over time `count`, `mean` and `squares/name` (M, T).
+    (M, R) seconds and `lost/name` (M, R); over time `STEP_SUMS` by name (M, T).
     `status` (M, 5) counts of what became of measurements, `without` (M,) rows without an estimate,
     `rows` (R,) that count, `time` (T,); `seconds` (M,) of filtering and `simulating` (), without
     compiling.
@@ -72,6 +72,8 @@ def computed(
 
 
 RUNWISE = ("score", "final", "converged", "lost")
+STEP_SUMS = ("count", "mean", "apart", "squares")
+"""what `step_sums` gives of each step"""
 SUMMED = ("missing", "status", "without")
 
 
@@ -185,11 +187,8 @@ def _reduced(
         if over_time:
             score = jnp.where(is_real[:, None], score, jnp.nan)
             is_score = ~jnp.isnan(score)
-            mean = average(score, 0)
-            apart = jnp.where(is_score, score - mean[None], 0)
-            found[f"count/{name}"] = jnp.sum(is_score, 0)
-            found[f"mean/{name}"] = mean
-            found[f"squares/{name}"] = jnp.sum(jnp.square(apart), 0)
+            for kind, x in zip(STEP_SUMS, step_sums(score, is_score), strict=True):
+                found[f"{kind}/{name}"] = x
     for name, converged, lost in limits:
         score = seen["scores"][name]
         if converged is not None:

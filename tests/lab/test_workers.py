@@ -25,10 +25,6 @@ ej.lab.compare(LINES, WORLD, **SETTING).to_netcdf(sys.argv[1])
 """
 
 
-def die(*_):
-    os._exit(1)
-
-
 @pytest.fixture(scope="module")
 def whole():
     return lab.compare(LINES, WORLD, **SETTING).dataset
@@ -40,7 +36,7 @@ def test_two_processes_and_what_a_dead_one_leaves(whole):
     with ProcessPoolExecutor(2, mp_context=spawn) as executor:
         found = lab.compare(LINES, WORLD, executor=executor, **SETTING)
         assert found.dataset.equals(whole)
-        executor.submit(die)
+        executor.submit(os._exit, 1)
         with pytest.warns(RuntimeWarning, match="a worker died"):
             found = lab.compare(LINES, WORLD, executor=executor, **SETTING)
         assert found.dataset.equals(whole)
