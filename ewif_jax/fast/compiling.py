@@ -112,6 +112,18 @@ def array(x: Numbers, dtype: DTypeLike = None) -> jax.Array:
     return jnp.asarray(x, dtype)
 
 
+def one_program(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn`, compiled as a whole where it is called by itself; JAX would compile each of its
+    operations. Inside another program it is a part of that."""
+    compiled = jax.jit(fn)
+
+    @wraps(fn)
+    def call(*args: Any) -> Any:
+        return fn(*args) if transformed() else compiled(*args)
+
+    return call
+
+
 def transformed() -> bool:
     """Whether what is called here becomes a part of another program."""
     return get_opaque_trace_state() != _OUTSIDE

@@ -10,7 +10,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from ewif_jax import checks
-from ewif_jax.fast.compiling import array
+from ewif_jax.fast.compiling import array, one_program
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
 from ewif_jax.models.powers import Stride, chosen, looked_up, power, squares_of, tables_of
@@ -28,7 +28,7 @@ def is_discrete(value: Numbers) -> bool:
 def constant(argument: str, value: Numbers, expected: tuple[int | str, ...]) -> Any:
     """A discrete F, Q or b as an array of NumPy or a function of `params`; what is refused, is."""
     if callable(value):
-        return partial(_read, named(value))
+        return partial(_read, named(one_program(value)))
     if isinstance(value, Tracer):
         return lambda params: value
     checks.shape(argument, value, expected)

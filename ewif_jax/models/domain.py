@@ -16,9 +16,11 @@ ROUNDING = 1e-5
 """How far below zero, as a share of the largest variance, rounding may take an eigenvalue."""
 
 
-def floating(value: Numbers) -> Array:
-    """As an array of floats: whole numbers are numbers too."""
-    value = jnp.asarray(value)
+def floating(value: Numbers) -> Any:
+    """As an array of floats: whole numbers are numbers too. What is known stays NumPy's, with which
+    nothing is compiled."""
+    concrete = checks.concrete_value(value)
+    value = jnp.asarray(value) if concrete is None else concrete
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
 
 

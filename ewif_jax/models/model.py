@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.fast.compiling import one_program
 from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern
 from ewif_jax.models import domain
@@ -133,7 +134,7 @@ def linear_model(
         n = F.shape[0]
     if not callable(Q) and Q is not None:
         checks.psd("Q", Q)
-    Q = constant("Q", Q, (n, n)) if is_discrete(Q) else named(Q)
+    Q = constant("Q", Q, (n, n)) if is_discrete(Q) else Q and named(one_program(Q))
     b = constant("b", b, (n,)) if is_discrete(b) else named(b)
     H_given, R_varies = H, callable(R)
     H, rows = by_sensor("H", H)

@@ -86,9 +86,9 @@ def _covariance(r: Parameter, m: int) -> Callable[..., Array]:
         value = resolve(r, params)
         if np.ndim(value) == 2:
             checks.shape("r", value, (m, m))
-            return jnp.asarray(domain.covariance("r", value))
+            return domain.covariance("r", value)
         value = domain.floating(domain.variance("r", value, params))
-        return value * jnp.eye(m, dtype=value.dtype)
+        return value * (jnp if isinstance(value, Array) else np).eye(m, dtype=value.dtype)
 
     return cov
 
@@ -108,7 +108,10 @@ def bank(
     angles = np.asarray([s.angle for s in group])
 
     def choose(values: list[Array], index: Array) -> Array:
-        return values[0] if len(values) == 1 else select(jnp.stack(values), index)
+        if len(values) == 1:
+            return values[0]
+        is_concrete = all(isinstance(x, np.ndarray) for x in (*values, np.asarray(index)))
+        return np.stack(values)[index] if is_concrete else select(jnp.stack(values), index)
 
     def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:
         return choose([s.observe(params, x, t) for s in group], sensor)

@@ -9,7 +9,7 @@ from jax import Array
 from jax.core import Tracer
 
 from ewif_jax import checks
-from ewif_jax.fast.compiling import array
+from ewif_jax.fast.compiling import array, one_program
 from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
@@ -22,7 +22,8 @@ def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
     if isinstance(x, Tracer):
         return partial(_looked_up, argument, lambda params: x), None
     if callable(x):
-        return (partial(_looked_up, argument, named(x)) if of_params(x) else named(x)), None
+        seen = named(one_program(x) if argument == "R" else x)  # R is looked at before tracing
+        return (partial(_looked_up, argument, seen) if of_params(x) else seen), None
     table = array(x)
     checks.finite(argument, x)
     checks.require(
@@ -33,7 +34,14 @@ def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
             checks.psd("R" if table.ndim == 2 else f"R[{k}]", matrix)
     if table.ndim == 2:
         return (lambda params, sensor, t: table), 0
-    return (lambda params, sensor, t: select(table, sensor)), table.shape[0]
+    matrices = np.asarray(x, table.dtype)
+
+    def chosen(params: Params, sensor: Any, t: Array) -> Any:
+        del params, t
+        is_number = isinstance(sensor, int | np.integer)
+        return matrices[sensor] if is_number else select(table, sensor)
+
+    return chosen, table.shape[0]
 
 
 def _looked_up(argument: str, x: Numbers, params: Params, sensor: Array, t: Array) -> Array:

@@ -37,13 +37,15 @@ def refuse_exact(model: Model, params: Params, t0: Numbers, method: str) -> None
 
 def refuse_one_way(model: Model, params: Params, method: str) -> None:
     """Refuses a known F that has no inverse."""
-    steps = model.steps
-    if model.linear is None or steps is None:
+    linear, steps = model.linear, model.steps
+    if linear is None or steps is None:
         return
-    with jax.ensure_compile_time_eval():
-        back = checks.concrete_value(model.linear.F(params, jnp.asarray(steps.dt), jnp.zeros(())))
+    back = None
+    if linear.F_where is None and linear.reversible:  # not a constant, whose rank is known
+        with jax.ensure_compile_time_eval():
+            back = checks.concrete_value(linear.F(params, jnp.asarray(steps.dt), jnp.zeros(())))
     checks.require(
-        back is None or bool(np.isfinite(back).all()),
+        linear.reversible and (back is None or bool(np.isfinite(back).all())),
         "F",
         f"a matrix that has an inverse: {method} moves what is known back in time (kalman, fading "
         "and square_root do not)",
