@@ -18,7 +18,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, screen
 from ewif_jax.estimator import Clock
 from ewif_jax.every_run import Content, examined, per_run_flags, same_runs
-from ewif_jax.fast.compiling import WIDE, quick_jit
+from ewif_jax.fast.compiling import WIDE, quick_jit, transformed
 from ewif_jax.fast.layout import (
     Frozen,
     device_count,
@@ -26,6 +26,7 @@ from ewif_jax.fast.layout import (
     over_devices,
 )
 from ewif_jax.fast.loops import Loop, over_runs
+from ewif_jax.fast.slopes import with_few_slopes
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.types import (
     DTypeLike,
@@ -117,7 +118,9 @@ def run_batch(
     count = device_count(runs, devices)
     inputs = (params, measurements, prior, times, keys, (context, refused))
     inputs = on_devices(inputs, flags, count)
-    return _run_batch(estimator, inputs, t0, Frozen(flags), clock, observe, count, content)
+    return _run_batch(
+        estimator, inputs, t0, Frozen(flags), clock, observe, count, content, transformed()
+    )
 
 
 def _filtered(
@@ -129,6 +132,7 @@ def _filtered(
     observe: Observer | None,
     devices: int,
     content: Content,
+    is_part: bool,
 ) -> Any:
     params, measurements, prior, times, keys, context = inputs
     dtype = float_dtype(measurements.value)
@@ -146,7 +150,10 @@ def _filtered(
         return _screened(loop, estimator, inputs, flags.tree, dtype)
 
     run = filtered if content.screened else screened
-    seen, state = over_devices(run, flags.tree, devices)(*inputs)
+    on_all = over_devices(run, flags.tree, devices)
+    if is_part:  # of a program that may be differentiated
+        on_all = with_few_slopes(on_all, flags.tree)
+    seen, state = on_all(*inputs)
     if observe is not None:
         return seen
     time, mean, cov, info = seen
@@ -175,7 +182,7 @@ def _screened(
     )
 
 
-_STATIC = ("estimator", "flags", "clock", "observe", "devices", "content")
+_STATIC = ("estimator", "flags", "clock", "observe", "devices", "content", "is_part")
 _run_batch = quick_jit(_filtered, _STATIC, WIDE)
 
 

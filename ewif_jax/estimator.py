@@ -1,5 +1,6 @@
 """Running an estimator: one arrival at a time (`step`) or a whole stream (`run`)."""
 
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -8,7 +9,8 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
-from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit
+from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit, transformed
+from ewif_jax.fast.slopes import with_few_slopes
 from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
@@ -89,17 +91,17 @@ def run(
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = prior_in(prior, float_dtype(measurements.value))
     filtered = _compiled(measurements.time.shape[0], state, key)
-    return filtered(estimator, params, measurements, prior, t0, times, clock, key)
+    return filtered(estimator, clock, params, measurements, prior, t0, times, key)
 
 
 def _filtered(
     estimator: Estimator,
+    clock: Clock,
     params: Params,
     measurements: Measurement,
     prior: Gaussian | None,
     t0: Numbers,
     times: Numbers,
-    clock: Clock,
     key: RandomKey,
 ) -> Trace:
     dtype = float_dtype(measurements.value)
@@ -120,8 +122,16 @@ def _filtered(
     return Trace(time, mean, cov, marked(info, refused), state)
 
 
+def _filtered_inside(estimator: Estimator, clock: Clock, *inputs: Any) -> Trace:
+    """The same as a part of a program that may be differentiated."""
+    shared = jax.tree.map(lambda _: False, inputs)
+    return with_few_slopes(partial(_filtered, estimator, clock), shared)(*inputs)
+
+
 def _compiled(arrivals: int, state: State, key: RandomKey) -> Any:
     """`_filtered`, compiled as hard as so many arrivals and such a state deserve."""
+    if transformed():
+        return _run_inside
     longest = max((x.shape[-1] for x in jax.tree.leaves(state) if x.ndim), default=1)
     if arrivals * max(longest, 100) <= 1e5:
         return _run_short
@@ -130,6 +140,7 @@ def _compiled(arrivals: int, state: State, key: RandomKey) -> Any:
 
 
 _STATIC = ("estimator", "clock")
+_run_inside = jax.jit(_filtered_inside, static_argnums=(0, 1))
 _run_wide = jax.jit(_filtered, static_argnames=_STATIC)
 _run_small = quick_jit(_filtered, _STATIC, QUICK)
 _run_short = quick_jit(_filtered, _STATIC, QUICKEST)

@@ -68,6 +68,12 @@ def total(terms: Iterable[Array]) -> Array:
     return reduce(add, terms)
 
 
+def stacked(parts: Sequence[Array]) -> Array:
+    """Arrays along a new first axis; what all runs share is repeated where others are of one."""
+    runs = jnp.broadcast_shapes(*(x.shape for x in parts))
+    return jnp.stack([jnp.broadcast_to(x, runs) for x in parts])
+
+
 def stage(fn: Function, *args: Array, batch: int) -> Any:
     """`fn` of arrays with `batch` trailing axes, for use inside a kernel: what other parts of the
     kernel read is computed once."""

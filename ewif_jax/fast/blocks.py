@@ -105,7 +105,7 @@ def _like(part: Array, same: Array) -> Array:
 
 @_like.defjvp
 def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return primals[1], tangents[0]
+    return _like(*primals), tangents[0]  # `primals[1]` would end the slopes of the next order
 
 
 # Why not the derivative of `dynamic_update_slice`: its transpose hands back the slopes of the whole

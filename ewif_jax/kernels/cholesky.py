@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ewif_jax.fast.batched import kernel, stage
+from ewif_jax.fast.batched import kernel, stacked, stage
 
 
 class Factor(NamedTuple):
@@ -114,7 +114,7 @@ def _forward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
         if j < n - 1:
             factors = lower[j + 1 :, j]
             b = _apart(n, _less, b[1:], _wide(factors, b), x[-1][None], batch=lower.ndim - 2)
-    return jnp.stack(x)
+    return stacked(x)
 
 
 def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
@@ -123,7 +123,7 @@ def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
         x.insert(0, _scaled(b[-1], reciprocal[j]))
         if j > 0:
             b = _apart(n, _less, b[:-1], _wide(lower[j, :j], b), x[0][None], batch=lower.ndim - 2)
-    return jnp.stack(x)
+    return stacked(x)
 
 
 def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> Array:

@@ -16,18 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax.fast.batched import kept_apart, kernel, stage, total
+from ewif_jax.fast.batched import kept_apart, kernel, stacked, stage, total
 from ewif_jax.fast.sparse import Pattern, by_row
-
-
-def upper(rows: Array) -> Array:
-    """The equations as a unit upper triangular matrix (n, n)."""
-    return _upper(rows)
-
-
-def strict(full: Array) -> Array:
-    """What lies above the diagonal of a matrix (n, n), row by row."""
-    return _strict(full)
+from ewif_jax.kernels import cholesky
+from ewif_jax.types import DTypeLike
 
 
 def solved(rows: Array, targets: Array) -> Array:
@@ -72,6 +64,16 @@ def covariance(inverse_rows: Array, variances: Array) -> Array:
     return _covariance(inverse_rows, variances)
 
 
+def of_covariance(cov: Array) -> tuple[Array, Array]:
+    """Variances and rows of a covariance (n, n), with the floor of `spread`."""
+    # In reverse order the lower factor is an upper one: P = U U', and U^-1 holds the equations.
+    found = cholesky.factor(cov[::-1, ::-1])
+    unit = (found.lower * found.reciprocal[None])[::-1, ::-1]
+    variances = jnp.square(jnp.diagonal(found.lower)[::-1])
+    floors = _least(len(cov), cov.dtype) * jnp.diagonal(cov)
+    return jnp.maximum(variances, floors), strict(inverse(strict(unit)))
+
+
 def spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
     """Variances and rows of sum_q variances_q vectors_q vectors_q', for vectors (n, q).
 
@@ -79,7 +81,7 @@ def spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
     good as certain stays regular.
     """
     unit, kept = _spread(vectors, variances)
-    return kept, _strict(_inverse(_strict(unit)))
+    return kept, strict(_inverse(strict(unit)))
 
 
 def carried(rows: Array, back: Array, where: Pattern) -> tuple[Array, Array]:
@@ -93,12 +95,18 @@ def is_upper(where: Pattern | None) -> bool:
     return where is not None and not np.tril(np.asarray(where, bool), -1).any()
 
 
+def _least(n: int, dtype: DTypeLike) -> float:
+    """The square of the rounding of a component: no variance is a smaller share of it."""
+    return (8 * n * float(jnp.finfo(dtype).eps)) ** 2
+
+
 def _order(rows: Array) -> int:
     return (1 + int(np.sqrt(8 * rows.shape[0] + 1))) // 2
 
 
 @kernel
-def _upper(rows: Array) -> Array:
+def upper(rows: Array) -> Array:
+    """The equations as a unit upper triangular matrix (n, n)."""
     n = _order(rows)
     index = np.full((n, n), rows.shape[0])
     index[np.triu_indices(n, 1)] = np.arange(rows.shape[0])
@@ -108,7 +116,8 @@ def _upper(rows: Array) -> Array:
 
 
 @kernel
-def _strict(full: Array) -> Array:
+def strict(full: Array) -> Array:
+    """What lies above the diagonal of a matrix (n, n), row by row."""
     n = full.shape[0]
     i, j = np.triu_indices(n, 1)
     return full.reshape(n * n, *full.shape[2:])[i * n + j]
@@ -119,26 +128,20 @@ def _pieces(rows: Array, n: int) -> list[Array]:
     return [rows[a:b] for a, b in pairwise(ends)]
 
 
-def _stacked(parts: list[Array]) -> Array:
-    """Along a new first axis; what all runs share is repeated where others are of one run."""
-    runs = jnp.broadcast_shapes(*(x.shape for x in parts))
-    return jnp.stack([jnp.broadcast_to(x, runs) for x in parts])
-
-
 @kernel
 def _solved(rows: Array, targets: Array) -> Array:
     n, found = targets.shape[0], []
     for k, row in reversed(list(enumerate(_pieces(rows, n)))):
         terms = [targets[k], *(-row[j] * x for j, x in enumerate(found))]
         found.insert(0, total(terms))
-    return _stacked(found)
+    return stacked(found)
 
 
 @kernel
 def _times(rows: Array, x: Array) -> Array:
     n = x.shape[0]
     pieces = enumerate(_pieces(rows, n))
-    return _stacked(
+    return stacked(
         [total([x[k], *(row[j] * x[k + 1 + j] for j in range(n - 1 - k))]) for k, row in pieces]
     )
 
@@ -178,7 +181,7 @@ def _absorbed(
 def _together(
     found: list[tuple[Array, Array, Array, Array]], rows: Array
 ) -> tuple[Array, Array, Array, Array]:
-    variances, leads, steps = (_stacked([x[i] for x in found]) for i in (0, 2, 3))
+    variances, leads, steps = (stacked([x[i] for x in found]) for i in (0, 2, 3))
     runs = jnp.broadcast_shapes(variances.shape[1:], rows.shape[1:])
     parts = [jnp.broadcast_to(x[1], (len(x[1]), *runs)) for x in found]
     return variances, jnp.concatenate(parts), leads, steps
@@ -227,7 +230,7 @@ def _answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Ar
     for k in range(targets.shape[0]):
         left = left - leads[k] * targets[k]
         new.append(targets[k] + steps[k] * left)
-    return _stacked(new)
+    return stacked(new)
 
 
 @kernel
@@ -272,15 +275,14 @@ def _covariance(inverse_rows: Array, variances: Array) -> Array:
 @kernel
 def _spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
     n, batch = vectors.shape[0], variances.ndim - 1
-    least = (8 * n * float(jnp.finfo(vectors.dtype).eps)) ** 2
-    floors = least * jnp.sum(vectors * vectors * variances[None], 1)
+    floors = _least(n, vectors.dtype) * jnp.sum(vectors * vectors * variances[None], 1)
     rest, columns, kept = vectors, [], []
     for j in reversed(range(n)):
         rest, column, variance = stage(_projected, rest, variances, floors[j], batch=batch)
         zeros = jnp.zeros((n - 1 - j, *column.shape[1:]), column.dtype)
         columns.insert(0, jnp.concatenate([column, zeros]))
         kept.insert(0, variance)
-    return jnp.stack(columns, 1), _stacked(kept)
+    return jnp.stack(columns, 1), stacked(kept)
 
 
 def _projected(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
@@ -303,9 +305,7 @@ def _carried(where: Pattern) -> Callable[[Array, Array], tuple[Array, Array]]:
         i, j = np.triu_indices(n, 1)
         diagonal = jnp.stack([back[k, k] for k in range(n)])
         if back.ndim == 2:
-            full = (
-                _upper(rows) @ back if n > 8 else jnp.sum(_upper(rows)[:, :, None] * back[None], 1)
-            )
+            full = upper(rows) @ back if n > 8 else jnp.sum(upper(rows)[:, :, None] * back[None], 1)
             return full[i, j] / diagonal[i], diagonal
         matrix = stage(_as_matrix, rows, batch=rows.ndim - 1)
         across = tuple(zip(*where, strict=True))
@@ -317,4 +317,4 @@ def _carried(where: Pattern) -> Callable[[Array, Array], tuple[Array, Array]]:
 
 
 def _as_matrix(rows: Array) -> Array:
-    return _upper(rows)
+    return upper(rows)

@@ -110,7 +110,7 @@ def bank(
     def choose(values: list[Array], index: Array) -> Array:
         if len(values) == 1:
             return values[0]
-        is_concrete = all(isinstance(x, np.ndarray) for x in (*values, np.asarray(index)))
+        is_concrete = not isinstance(index, Array) and not any(isinstance(x, Array) for x in values)
         return np.stack(values)[index] if is_concrete else select(jnp.stack(values), index)
 
     def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:

@@ -51,8 +51,7 @@ def start(model: Model, params: Params, prior: Gaussian | None, t0: Numbers) -> 
         return InformationState(t0, nothing, *_unknown(nothing))
     checks.psd("prior.cov", prior.cov, definite=True)
     mean = jnp.asarray(prior.mean)
-    lower = cholesky.factor(jnp.asarray(prior.cov, mean.dtype)).lower
-    variances, rows = equations.spread(lower, jnp.ones_like(mean))
+    variances, rows = equations.of_covariance(jnp.asarray(prior.cov, mean.dtype))
     return InformationState(
         jnp.asarray(t0, mean.dtype), mean, variances, rows, jnp.zeros_like(mean)
     )

@@ -1,6 +1,6 @@
 """The fast layout changes no number: `run_batch` is `vmap(run)`, with shared and per-run inputs."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -171,6 +171,51 @@ def test_gradients_go_through_groups_of_runs(steps, groups):
     np.testing.assert_allclose(slopes[0], in_q, rtol=1e-10)
     np.testing.assert_allclose(slopes[1], in_values, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(forward, in_q, rtol=1e-10)
+
+
+def derivatives_in_q(filtered, q, per_run):
+    """Reverse mode, forward mode, forward over reverse, and two directions in one pass."""
+    measurements = regular(40, 20)
+
+    def loss(q):
+        trace = filtered({"q": q}, measurements, per_run)
+        return jnp.sum(trace.mean**2) + jnp.sum(trace.cov) ** 2
+
+    @jax.jit
+    def all_of_them(q):
+        ones, ramp = jnp.ones_like(q), jnp.linspace(-1.0, 2.0, q.size).reshape(q.shape)
+        along = jax.jvp(lambda q: jax.jvp(loss, (q,), (ones,)), (q,), (ramp,))
+        return along, jax.jvp(jax.grad(loss), (q,), (ramp,))
+
+    return jax.device_get(all_of_them(jnp.asarray(q)))
+
+
+def batch_in_q(params, measurements, per_run):
+    start = {"prior": PRIOR, "t0": 0.0, "params_per_run": per_run}
+    return ej.run_batch(ej.kalman(MODEL), params, measurements, **start)
+
+
+def runs_in_q(params, measurements, per_run):
+    axes = ({"q": 0 if per_run else None}, ej.Measurement(None, 0, None, None))
+    alone = partial(ej.run, ej.kalman(MODEL), prior=PRIOR, t0=0.0)
+    return jax.vmap(alone, in_axes=axes)(params, measurements)
+
+
+@cache
+def derivatives_one_by_one(per_run):
+    return derivatives_in_q(runs_in_q, own_q(per_run), per_run)
+
+
+def own_q(per_run):
+    return np.linspace(0.2, 2.0, 40) if per_run else np.array(0.7)
+
+
+@pytest.mark.parametrize("per_run", [False, True], ids=["shared", "per_run"])
+def test_slopes_in_few_numbers_are_those_of_the_runs(per_run, groups):
+    """Of every order and in both modes, although they are computed beside the values."""
+    found = derivatives_in_q(batch_in_q, own_q(per_run), per_run)
+    wanted = derivatives_one_by_one(per_run)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), found, wanted)
 
 
 def test_batches_can_be_mapped_over_parameters(groups):
