@@ -111,7 +111,9 @@ def bank(
         if len(values) == 1:
             return values[0]
         is_concrete = not isinstance(index, Array) and not any(isinstance(x, Array) for x in values)
-        return np.stack(values)[index] if is_concrete else select(jnp.stack(values), index)
+        if not is_concrete:
+            return select(jnp.stack(values), index)
+        return np.stack(values)[np.minimum(index, len(values) - 1)]  # refused elsewhere, by name
 
     def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:
         return choose([s.observe(params, x, t) for s in group], sensor)

@@ -39,7 +39,7 @@ def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
     def chosen(params: Params, sensor: Any, t: Array) -> Any:
         del params, t
         is_number = isinstance(sensor, int | np.integer)
-        return matrices[sensor] if is_number else select(table, sensor)
+        return matrices[min(sensor, len(matrices) - 1)] if is_number else select(table, sensor)
 
     return chosen, table.shape[0]
 
