@@ -97,6 +97,12 @@ def positive(argument: str, x: Numbers) -> Any:
     return x
 
 
+def positive_number(argument: str, x: Numbers) -> Any:
+    """Refuses what is not one positive number, known or not; returns it."""
+    require(np.size(x) == 1, argument, "one number", f"shape {np.shape(x)}")
+    return positive(argument, x)
+
+
 def at_least(argument: str, x: Numbers, bound: float) -> Any:
     """Refuses a value below `bound`; returns it."""
     value = concrete_value(x)

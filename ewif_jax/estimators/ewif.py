@@ -53,7 +53,10 @@ def ewif(
 
     A measurement without noise (a singular R) is refused if R is known, else `REJECTED`: an R that
     tends to 0 still weights such measurements among themselves. So is one whose way back has no
-    finite numbers.
+    finite numbers. A discrete F without inverse is refused if it is known. Inside a trace it is as
+    right as any other while the state is determined; what is known of a part of the state cannot
+    pass it: from there on the estimate is NaN, every measurement `REJECTED`, the log likelihood
+    minus infinity.
 
     Reduces to: `kalman` without process noise as tau grows; `fading` with inflation exp(dt / tau)
         and Q = 0; least squares over all the data (8)-(9).
@@ -63,22 +66,22 @@ def ewif(
         which is not the covariance of the error under its model (3).
 
     Raises:
-        ValueError: both or neither of `tau` and `weight`; tau <= 0; a model that is not linear; a
-            singular R; a constant F without inverse.
+        ValueError: both or neither of `tau` and `weight`; a tau that is not one number > 0; a
+            model that is not linear; a singular R; a constant F without inverse.
     """
     need_linear(model, "ewif")
     need_reversible(model, "ewif")
     one = (tau is None) != (weight is None)
     checks.require(one, "tau", "one of `tau` and `weight`", (tau, weight))
     if tau is not None and not callable(tau):
-        checks.positive("tau", tau)
+        checks.positive_number("tau", tau)
 
     def start(
         params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
     ) -> InformationState:
         del key
         if tau is not None:
-            checks.positive("tau", resolve(tau, params))
+            checks.positive_number("tau", resolve(tau, params))
         refuse_exact(model, params, t0, "ewif")
         refuse_one_way(model, params, "ewif")
         return form.start(model, params, prior, t0)
@@ -119,7 +122,7 @@ def growth(
         return reciprocal_square(jnp.asarray(weight(params, measured, now), now.dtype))
 
     def by_decay(params: Params, measured: Array, now: Array) -> Array:
-        decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), now.dtype)
-        return exponential(now - measured, decay)
+        decay = jnp.asarray(checks.positive_number("tau", resolve(tau, params)), now.dtype)
+        return exponential(now - measured, decay.reshape(()))
 
     return by_decay if weight is None else by_weight

@@ -23,8 +23,8 @@ def information(model: Model) -> Estimator:
         P_k^{-1} = A' (P_{k-1} + A Q A')^{-1} A + H' R^{-1} H \quad (33)
 
     with A back from k to k-1: Shulami & Sigalov, eqs. (32)-(33). Neither Q nor R nor the
-    information matrix has to be invertible. `prior=None` as in `ewif`, late measurements as in
-    `kalman`.
+    information matrix has to be invertible. `prior=None` as in `ewif`, and so an F that turns out
+    singular inside a trace; late measurements as in `kalman`.
 
     Reduces to: `kalman` with the same prior.
 

@@ -16,9 +16,11 @@ def kalman(model: Model) -> Estimator:
         \hat x &= \hat x^- + K (z - H \hat x^-), \quad K = P^- H' (H P^- H' + R)^{-1} \quad (30) \\
         P &= (I - K H) P^- (I - K H)' + K R K'
 
-    after Shulami & Sigalov, section V-B. Q, P and R may be singular or zero. A late measurement is
-    not used (`TOO_LATE`): lift the filter with `replay`, or choose a method of `oosm`. Asked for a
-    time before its own it predicts NaN.
+    after Shulami & Sigalov, section V-B. Q, P and R may be singular or zero; a component that is
+    measured exactly (R zero in its direction) and known exactly already tells nothing, whatever its
+    value: it moves nothing, and counts 0 in the log likelihood. A late measurement is not used
+    (`TOO_LATE`): lift the filter with `replay`, or choose a method of `oosm`. Asked for a time
+    before its own it predicts NaN.
 
     Args:
         model: a linear `Model`; its parameters may be functions of `params`.

@@ -58,13 +58,13 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
     need_reversible(model, "limited_memory")
     checks.whole("capacity", capacity, 1)
     if not callable(window):
-        checks.positive("window", window)
+        checks.positive_number("window", window)
 
     def first_state(
         params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
     ) -> WindowState:
         del key
-        checks.positive("window", resolve(window, params))
+        checks.positive_number("window", resolve(window, params))
         refuse_exact(model, params, t0, "limited_memory")
         start = form.start(model, params, prior, t0)
         # As an argument: a table of NumPy cannot be indexed while tracing.
@@ -92,9 +92,11 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         safe = state.buffer._replace(
             time=jnp.where(near, stamps, time), mask=state.buffer.mask & near[:, None]
         )
-        told, targets, noise = jax.vmap(partial(form.contribution, model, params, base))(safe)
-        flat = told.reshape(-1, told.shape[-1]), noise.ravel(), targets.ravel()
-        return form.recentred(form.gathered(base, *flat))
+        told, targets, noise, sizes = jax.vmap(partial(form.contribution, model, params, base))(
+            safe
+        )
+        told, sizes = (x.reshape(-1, x.shape[-1]) for x in (told, sizes))
+        return form.recentred(form.gathered(base, told, noise.ravel(), targets.ravel(), sizes))
 
     def move(params: Params, state: WindowState, time: Array) -> WindowState:
         del params

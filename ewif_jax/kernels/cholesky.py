@@ -22,15 +22,17 @@ class Factor(NamedTuple):
     full_rank: Array
 
 
-def factor(a: Array, tolerance: float | None = None) -> Factor:
+def factor(a: Array, tolerance: float | None = None, size: Array | None = None) -> Factor:
     """The guarded Cholesky factor of a symmetric (n, n) matrix.
 
     A pivot counts as zero when it is below `tolerance` times the diagonal element it came from
-    (default 8 n eps): then its column is zero and `full_rank` is False.
+    (default 8 n eps), or times the `size` (n,) of the terms that element was summed from: then its
+    column is zero and `full_rank` is False.
     """
     if tolerance is None:
         tolerance = negligible(a.shape[0], a.dtype)
-    lower, reciprocal = _factor(tolerance)(a)
+    sizes = () if size is None else (size,)
+    lower, reciprocal = _factor(tolerance)(a, *sizes)
     return Factor(lower, reciprocal, jnp.all(reciprocal > 0))
 
 
@@ -71,8 +73,8 @@ def half_log_det(f: Factor) -> Array:
 
 
 @cache
-def _factor(tolerance: float) -> Callable[[Array], tuple[Array, Array]]:
-    return kernel(lambda a: _factored(a, tolerance))
+def _factor(tolerance: float) -> Callable[..., tuple[Array, Array]]:
+    return kernel(lambda a, *size: _factored(a, tolerance, *size))
 
 
 @cache
@@ -80,11 +82,13 @@ def _solved(tolerance: float) -> Callable[[Array, Array], Array]:
     return kernel(lambda a, b: _solve_rows(*_factored(a, tolerance), b))
 
 
-def _factored(a: Array, tolerance: float) -> tuple[Array, Array]:
+def _factored(a: Array, tolerance: float, size: Array | None = None) -> tuple[Array, Array]:
     n, batch = a.shape[0], a.ndim - 2
     columns, reciprocals, rest = [], [], a
     for j in range(n):
-        column, reciprocal = _apart(n, _column(tolerance), rest, a[j, j], batch=batch)
+        column, reciprocal = _apart(
+            n, _column(tolerance), rest, a[j, j] if size is None else size[j], batch=batch
+        )
         columns.append(lax.pad(column, jnp.zeros((), a.dtype), [(j, 0, 0), *[(0, 0, 0)] * batch]))
         reciprocals.append(reciprocal)
         if j < n - 1:

@@ -33,15 +33,17 @@ def times(rows: Array, x: Array) -> Array:
 
 
 def absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array
+    variances: Array, rows: Array, equation: Array, noise: Array, size: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
     """Variances and rows with one more `equation` (n,), whose error has variance `noise` ().
+    `size` (n,) of the terms that its coefficients were summed from, where they may cancel.
 
     Also leads and steps (n,): what `answered` needs to do the same to the targets, which are the
     only part that depends on data. A direction about which nothing is known is learnt from an
     equation only where that is more than the rounding of taking out what is known.
     """
-    return _absorbed(variances, rows, equation, noise)
+    sizes = () if size is None else (size,)
+    return _absorbed(variances, rows, equation, noise, *sizes)
 
 
 def answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
@@ -65,23 +67,13 @@ def covariance(inverse_rows: Array, variances: Array) -> Array:
 
 
 def of_covariance(cov: Array) -> tuple[Array, Array]:
-    """Variances and rows of a covariance (n, n), with the floor of `spread`."""
+    """Variances and rows of a covariance (n, n), with the floor of `orthogonal.spread`."""
     # In reverse order the lower factor is an upper one: P = U U', and U^-1 holds the equations.
     found = cholesky.factor(cov[::-1, ::-1])
     unit = (found.lower * found.reciprocal[None])[::-1, ::-1]
     variances = jnp.square(jnp.diagonal(found.lower)[::-1])
-    floors = _least(len(cov), cov.dtype) * jnp.diagonal(cov)
+    floors = least_share(len(cov), cov.dtype) * jnp.diagonal(cov)
     return jnp.maximum(variances, floors), strict(inverse(strict(unit)))
-
-
-def spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
-    """Variances and rows of sum_q variances_q vectors_q vectors_q', for vectors (n, q).
-
-    No variance is below the rounding of its component, (8 n eps)^2 of it: what the motion makes as
-    good as certain stays regular.
-    """
-    unit, kept = _spread(vectors, variances)
-    return kept, strict(_inverse(strict(unit)))
 
 
 def carried(rows: Array, back: Array, where: Pattern) -> tuple[Array, Array]:
@@ -95,7 +87,7 @@ def is_upper(where: Pattern | None) -> bool:
     return where is not None and not np.tril(np.asarray(where, bool), -1).any()
 
 
-def _least(n: int, dtype: DTypeLike) -> float:
+def least_share(n: int, dtype: DTypeLike) -> float:
     """The square of the rounding of a component: no variance is a smaller share of it."""
     return (8 * n * float(jnp.finfo(dtype).eps)) ** 2
 
@@ -162,10 +154,10 @@ def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array
 
 @kernel
 def _absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array
+    variances: Array, rows: Array, equation: Array, noise: Array, size: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
     n, batch = equation.shape[0], equation.ndim - 1
-    scale, found = jnp.abs(equation), []
+    scale, found = jnp.abs(equation) if size is None else size, []
     for k, row in enumerate(_pieces(rows, n)):
         variance, noise, lead, step = stage(
             _met(n), variances[k], noise, equation[0], scale[0], batch=batch
@@ -201,6 +193,10 @@ def _met(n: int) -> Callable[..., tuple[Array, ...]]:
         v, r = jnp.where(unknown, 0, variance), jnp.where(telling, noise, 0)
         rounding = 8 * n * float(jnp.finfo(lead.dtype).eps) * scale
         lead = jnp.where(unknown & (jnp.abs(lead) <= rounding), 0, lead)
+        # What an exact equation says by rounding alone would be believed. Several have rounded it.
+        rounding = jnp.where(unknown, 0, 8 * rounding)
+        blind = (r <= rounding * (rounding * v)) & (jnp.abs(lead) <= rounding)
+        lead = jnp.where(blind, 0, lead)
         again, both, step = _weighed(v, r, lead)
         fresh = unknown & telling & (lead != 0)
         inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
@@ -270,31 +266,6 @@ def _covariance(inverse_rows: Array, variances: Array) -> Array:
     scaled = inverse_rows * variances[None]
     i, j = np.triu_indices(n)
     return total(scaled[i, k] * inverse_rows[j, k] for k in range(n))
-
-
-@kernel
-def _spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
-    n, batch = vectors.shape[0], variances.ndim - 1
-    floors = _least(n, vectors.dtype) * jnp.sum(vectors * vectors * variances[None], 1)
-    rest, columns, kept = vectors, [], []
-    for j in reversed(range(n)):
-        rest, column, variance = stage(_projected, rest, variances, floors[j], batch=batch)
-        zeros = jnp.zeros((n - 1 - j, *column.shape[1:]), column.dtype)
-        columns.insert(0, jnp.concatenate([column, zeros]))
-        kept.insert(0, variance)
-    return jnp.stack(columns, 1), stacked(kept)
-
-
-def _projected(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
-    """Takes the last vector out of the others."""
-    last = rest[-1]
-    weighted = last * variances
-    variance = jnp.maximum(jnp.sum(last * weighted, 0), floor)
-    some = variance > 0
-    reciprocal = jnp.where(some, 1 / jnp.where(some, variance, 1), 0)
-    column = jnp.sum(rest[:-1] * weighted[None], 1) * reciprocal[None]
-    one = jnp.ones((1, *column.shape[1:]), column.dtype)
-    return rest[:-1] - column[:, None] * last[None], jnp.concatenate([column, one]), variance
 
 
 @cache

@@ -1,12 +1,12 @@
 """The measurement update of a Gaussian: masked, singular-safe, Joseph-stabilised."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from ewif_jax.fast.batched import kernel, total
 from ewif_jax.fast.small import matmul
@@ -29,21 +29,28 @@ def mask_cov(cov: Array, mask: Array) -> Array:
     return jnp.where(both, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
 
 
-def innovate(difference: Array, cross: Array, cov: Array, mask: Array) -> Innovation:
-    """The innovation with absent components taken out: zero difference and gain, unit variance."""
+def innovate(
+    difference: Array, cross: Array, cov: Array, mask: Array, size: Array | None = None
+) -> Innovation:
+    """The innovation with absent components taken out: zero difference and gain, unit variance.
+    `size` (m,) of the terms that the variances were summed from, if larger (see `sizes`)."""
     cov = mask_cov(cov, mask)
     return Innovation(
         jnp.where(mask, difference, 0),
         cov,
-        cholesky.factor(cov),
+        cholesky.factor(cov, size=size),
         jnp.where(mask[:, None], cross, 0),
     )
 
 
 def log_density(innovation: Innovation, mask: Array) -> Array:
-    """log N(value; 0, cov) over the components that exist."""
+    """log N(value; 0, cov) over the components that exist and are not known already.
+
+    A component whose variance is zero given the ones before it has no density: it tells nothing,
+    moves nothing (see `cholesky.factor`), and counts 0.
+    """
     white = cholesky.forward(innovation.factor, innovation.value)
-    count = jnp.sum(mask).astype(white.dtype)
+    count = jnp.sum(mask & (innovation.factor.reciprocal > 0)).astype(white.dtype)
     half_log_det = cholesky.half_log_det(innovation.factor)
     return -0.5 * (jnp.sum(jnp.square(white)) + count * jnp.log(2 * jnp.pi)) - half_log_det
 
@@ -69,17 +76,41 @@ def update(
     (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
     result of the first, which is what makes the Joseph form forget rounding errors of the gain.
     What P itself was rounded by it cannot forget: where that exceeds a variance that is left (a
-    prior 1/eps times as wide as R), the variance is 0, never negative.
+    prior 1/eps times as wide as R), the variance is 0, never negative. So is one that an exact
+    measurement leaves: its rounding would be weighed like knowledge by the next such measurement.
     """
     H, R = jnp.where(mask[:, None], H, 0), mask_cov(R, mask)
     cross = symmetric.rows(H, packed, H_where)
     cov = _expected(H_where)(cross, H, R)
-    innovation = Innovation(jnp.where(mask, difference, 0), cov, cholesky.factor(cov), cross)
+    factor = cholesky.factor(cov, size=sizes(packed, H, R, H_where))
+    innovation = Innovation(jnp.where(mask, difference, 0), cov, factor, cross)
     weights = cholesky.solve(innovation.factor, cross)
     mean = _moved(mean, weights, innovation.value)
     half = _less(packed, cross, weights)
     left_over = _left_over(R, weights, symmetric.rows(H, half, H_where))
-    return mean, _more(half, weights, left_over), innovation
+    least = _least(mean.shape[0])(R, cov)
+    return mean, _more(packed, half, weights, left_over, least), innovation
+
+
+def rounding_of(predicted: Array) -> Array:
+    """Deviations (m,) from a prediction that are no more than what a few operations round it by."""
+    return 64 * jnp.finfo(predicted.dtype).eps * jnp.abs(predicted)
+
+
+def sizes(packed: Array, H: Array, R: Array, H_where: Pattern | None = None) -> Array | None:
+    """R_kk plus n times the sum of H_ki^2 P_ii, (m,): how large the terms are, together, that may
+    cancel in H P H' + R. None where there is one term only. H and R are masked."""
+    if H_where is not None and max(map(sum, H_where)) <= 1:
+        return None
+    return _terms(packed, H, R)
+
+
+@kernel
+def _terms(packed: Array, H: Array, R: Array) -> Array:
+    m, n = H.shape[:2]
+    variances = packed[_diagonal(n)]
+    noise = jnp.stack([R[k, k] for k in range(m)])
+    return noise + n * total(jnp.square(H[:, i]) * variances[i][None] for i in range(n))
 
 
 @cache
@@ -103,15 +134,18 @@ def update_from_afar(
     spread: Array,
     R: Array,
     mask: Array,
+    size: Array | None = None,
 ) -> tuple[Array, Array, Innovation]:
     """`update` by a measurement of something else: `cross` (m, n) is its covariance with the state,
-    `spread` (m, m) its own without noise."""
-    innovation = innovate(difference, cross, spread + R, mask)
+    `spread` (m, m) its own without noise, `size` as in `innovate`."""
+    innovation = innovate(difference, cross, spread + R, mask, size)
     weights = cholesky.solve(innovation.factor, innovation.cross)
     mean = _moved(mean, weights, innovation.value)
     half = _less(packed, innovation.cross, weights)
     seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask[None, :], spread, 0), weights)
-    return mean, _more(half, weights, _left_over(mask_cov(R, mask), weights, seen)), innovation
+    R = mask_cov(R, mask)
+    least = _least(mean.shape[0])(R, innovation.cov)
+    return mean, _more(packed, half, weights, _left_over(R, weights, seen), least), innovation
 
 
 @kernel
@@ -134,11 +168,42 @@ def _left_over(R: Array, weights: Array, seen: Array) -> Array:
 
 
 @kernel
-def _more(half: Array, weights: Array, left_over: Array) -> Array:
-    """half + K left_over, packed, no variance below 0."""
+def _more(packed: Array, half: Array, weights: Array, left_over: Array, least: Array) -> Array:
+    """half + K left_over, packed, no variance below 0, and none of what is less than `least` () of
+    what it was, which is rounding. Its derivatives stay."""
     rows, cols = np.triu_indices(weights.shape[1])
     cov = half + _contract(weights[:, rows], left_over[:, cols])
-    return symmetric.no_negative(cov)
+    rounding = jnp.where(jnp.abs(cov) < least[None] * jnp.abs(packed), cov, 0)
+    return symmetric.no_negative(cov - lax.stop_gradient(rounding))
+
+
+def cleared(packed: Array, before: Array, R: Array, innovation_cov: Array) -> Array:
+    """A packed covariance after a measurement without what is only rounding of the one before."""
+    least = _least(symmetric.order(packed))(R, innovation_cov)
+    return packed - lax.stop_gradient(
+        jnp.where(jnp.abs(packed) < least * jnp.abs(before), packed, 0)
+    )
+
+
+@cache
+def _least(n: int) -> Callable[[Array, Array], Array]:
+    """Which share of a covariance (n, n) is rounding after a measurement of noise R and innovation
+    covariance `cov`: Joseph's form leaves the square of what the covariance was rounded by. Where
+    nothing but exact components is seen, even its rounding is larger than all that is right."""
+
+    @kernel
+    def least(R: Array, cov: Array) -> Array:
+        share = cholesky.negligible(n, cov.dtype)
+        noise, spread = ([x[k, k] for k in range(x.shape[0])] for x in (R, cov))
+        # What is absent has the same of both.
+        exact = [(r <= share**2 * s) | (r == s) for r, s in zip(noise, spread, strict=True)]
+        return jnp.where(reduce(jnp.logical_and, exact), 64 * share, share**2).astype(cov.dtype)
+
+    return least
+
+
+def _diagonal(n: int) -> np.ndarray:
+    return np.diagonal(symmetric.places(n))
 
 
 def _contract(a: Array, b: Array) -> Array:

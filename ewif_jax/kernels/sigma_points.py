@@ -73,5 +73,6 @@ def update(
     value = jnp.where(mask, difference, 0)
     left = matmul(lower, jnp.eye(mean.shape[0], dtype=mean.dtype) - matmul(weights.T, D))
     packed = symmetric.pack(matmul(left, left.T) + matmul(matmul(gain, R), gain.T))
+    packed = gaussian.cleared(packed, symmetric.pack(matmul(lower, lower.T)), R, cov)
     innovation = gaussian.Innovation(value, cov, factor, matmul(D, lower.T))
     return mean + matvec(gain, value), packed, innovation

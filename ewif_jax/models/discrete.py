@@ -103,13 +103,29 @@ def transition_of_steps(F: Parameter, steps: Steps) -> Function:
         return _switch(
             [
                 (k > 1, lambda: power(Stride(ahead), k, steps).F),
-                (k == -1, lambda: jnp.linalg.inv(behind)),
-                (k < -1, lambda: power(Stride(jnp.linalg.inv(behind)), -k, steps).F),
+                (k == -1, lambda: _inverse(behind)),
+                (k < -1, lambda: _back(behind, -k, steps)),
             ],
             lambda: chosen(k > 0, first, _nothing(eye, whole)),
         )
 
     return matrix
+
+
+def _inverse(F: Array) -> Array:
+    """F^-1 (n, n), NaN where F is singular to rounding: the inverse is then some large numbers."""
+    inverse = jnp.linalg.inv(F)
+    size, size_back = (jnp.max(jnp.sum(jnp.abs(x), 1)) for x in (F, inverse))
+    good = size * size_back * F.shape[0] * jnp.finfo(F.dtype).eps < 1  # the condition number
+    return jnp.where(good, inverse, jnp.nan)
+
+
+def _back(F: Array, k: Array, steps: Steps) -> Array:
+    """F^-k (n, n): NaN where F is singular, infinite where it only grows too large."""
+    inverse = _inverse(F)
+    far = power(Stride(inverse), k, steps).F
+    usable = jnp.all(jnp.isfinite(far)) | jnp.any(jnp.isnan(inverse))
+    return jnp.where(usable, far, jnp.inf)
 
 
 def input_of_steps(F: Parameter, b: Parameter, steps: Steps) -> Function:

@@ -119,10 +119,11 @@ def asd(model: Model, lag: int) -> Estimator:
         passed = window.passed(state.kept, first, entry, matmul(H, cross), difference)
         D = matmul(state.F, passed.D[-1]) + jnp.where(place == count, entry, 0)
         U, nu = passed.U[-1], passed.nu[-1]
-        whole = gaussian.innovate(nu, D.T, U + R, mask)
+        size = gaussian.sizes(cov, H, R)
+        whole = gaussian.innovate(nu, D.T, U + R, mask, size)
         if state.share is not None:
             R = R + _excess(state.share) * jnp.where(mask[:, None] & mask[None, :], whole.cov, 0)
-        now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask)[:2]
+        now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask, size)[:2]
         mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
         weight, pull, gain = _solved(innovation)
         new = window.Kept(measurement.time, mean, cov, after, H, R, gain, weight, pull)
@@ -170,7 +171,7 @@ def _solved(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:
     m = innovation.value.shape[0]
     eye = jnp.eye(m, dtype=innovation.value.dtype)
     right = jnp.concatenate([eye, innovation.value[:, None], innovation.cross], 1)
-    ratio = cholesky.solved(innovation.cov, right)
+    ratio = cholesky.solve(innovation.factor, right)
     return ratio[:, :m], ratio[:, m], ratio[:, m + 1 :].T
 
 

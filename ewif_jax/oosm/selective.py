@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ewif_jax import checks
 from ewif_jax.models import resolve
@@ -69,7 +70,7 @@ def selective(estimator: Estimator, max_delay: Parameter, softness: Parameter = 
     if not callable(max_delay):
         checks.at_least("max_delay", max_delay, 0.0)
     if softness is not None and not callable(softness):
-        checks.positive("softness", softness)
+        checks.positive_number("softness", softness)
 
     def init(params: Params, prior: Gaussian | None, t0: Numbers, key: RandomKey = None) -> Any:
         state = estimator.init(params, prior, t0, key)
@@ -78,10 +79,12 @@ def selective(estimator: Estimator, max_delay: Parameter, softness: Parameter = 
     def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         delay = state.time - measurement.time
         limit = checks.at_least("max_delay", resolve(max_delay, params), 0.0)
+        checks.require(np.size(limit) == 1, "max_delay", "one number", f"shape {np.shape(limit)}")
+        limit = jnp.reshape(limit, ())
         if softness is None:
             fresh = (delay <= 0) | (delay < limit)
             return offered(estimator.update, params, state, measurement, fresh)
-        width = checks.positive("softness", resolve(softness, params))
+        width = checks.positive_number("softness", resolve(softness, params))
         share = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
         return partly(estimator, share.astype(state.time.dtype)).update(params, state, measurement)
 

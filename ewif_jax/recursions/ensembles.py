@@ -122,8 +122,7 @@ def look(
     deviations = jnp.where(mask[:, None] & every_offset, offsets - shift[:, None], 0)
     # After an exact measurement members differ by rounding only, which would be weighed like
     # knowledge by the next one: a component without noise would divide by it.
-    rounding = 8 * jnp.finfo(origin.dtype).eps * jnp.abs(origin)
-    apart = jnp.max(jnp.abs(deviations), 1) > rounding
+    apart = jnp.max(jnp.abs(deviations), 1) > gaussian.rounding_of(origin)
     deviations = jnp.where(apart[:, None], deviations, 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
     cov = spread(deviations) + R

@@ -18,9 +18,11 @@ from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
+from ewif_jax.kernels.orthogonal import spread
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
-from ewif_jax.models.linearise import affine_flow, observation, patterns, size
+from ewif_jax.models.linearise import affine_flow, patterns, size
+from ewif_jax.recursions.sighting import noise_of, sight, still_at_once, summed
 from ewif_jax.types import Gaussian, Info, Measurement, Numbers, Params, Status
 
 
@@ -84,7 +86,15 @@ def transport(
             targets=faded.targets / diagonal,
         )
     back, _ = affine_flow(model, params, time, state.time, dtype)
-    return moved(faded, F, back, noise)._replace(mean=mean)
+    F, back = (still_at_once(model, x, time == state.time) for x in (F, back))
+    arrived = moved(faded, F, back, noise)._replace(mean=mean)
+    if model.steps is None:
+        return arrived
+    # Of a part of the state, what is known cannot pass a singular F: no estimate after it is the
+    # least-squares one. (Where F^-k only overflows it is infinite, and the part is forgotten.)
+    partly = ~determined(state) & jnp.any(~jnp.isinf(state.variances))
+    lost = partly & jnp.all(jnp.isnan(back))
+    return arrived._replace(variances=jnp.where(lost, jnp.nan, arrived.variances))
 
 
 def moved(
@@ -101,18 +111,20 @@ def moved(
     vectors = matmul(ahead, equations.inverse(state.rows))
     error = matvec(vectors, state.targets)
     if noise is None:
-        kept, rows = equations.spread(vectors, variances)
+        kept, rows = spread(vectors, variances)
     else:
         both = jnp.concatenate([variances, jnp.ones_like(variances)])
-        kept, rows = equations.spread(jnp.concatenate([vectors, noise], 1), both)
+        kept, rows = spread(jnp.concatenate([vectors, noise], 1), both, certain=True)
     targets = equations.times(rows, error)
     certain = state._replace(variances=kept, rows=rows, targets=targets)
     usable = jnp.all(jnp.isfinite(back))
     back = jnp.where(usable, back, jnp.eye(n, dtype=back.dtype))
     told = matmul(equations.upper(state.rows), back)
+    sizes = matmul(jnp.abs(equations.upper(state.rows)), jnp.abs(back))
     spreads = jnp.where(usable, state.variances, jnp.inf)
     if noise is None:
-        partial = gathered(state._replace(**_nothing(state.mean)), told, spreads, state.targets)
+        nothing = state._replace(**_nothing(state.mean))
+        partial = gathered(nothing, told, spreads, state.targets, sizes)
     else:
         # Of (u, x) with noise L u, u of unit variance: u is eliminated by coming first.
         eye, zeros = jnp.eye(n, dtype=back.dtype), jnp.zeros((n, n), back.dtype)
@@ -125,6 +137,12 @@ def moved(
             wide,
             jnp.concatenate([jnp.ones_like(spreads), spreads]),
             jnp.concatenate([jnp.zeros_like(state.targets), state.targets]),
+            jnp.concatenate(
+                [
+                    jnp.concatenate([eye, zeros], 1),
+                    jnp.concatenate([matmul(sizes, jnp.abs(noise)), sizes], 1),
+                ]
+            ),
         )
         partial = state._replace(
             variances=both.variances[n:],
@@ -135,19 +153,23 @@ def moved(
 
 
 def gathered(
-    state: InformationState, told: Array, variances: Array, targets: Array
+    state: InformationState,
+    told: Array,
+    variances: Array,
+    targets: Array,
+    sizes: Array | None = None,
 ) -> InformationState:
     """The state with further equations (k, n), their variances (k,) and targets (k,), around the
-    same reference."""
+    same reference; `sizes` (k, n) as in `equations.absorbed`."""
 
-    def add(is_determined: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[Any, None]:
-        equation, variance, target = new
-        kept, rows, answers = is_determined
-        kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance)
+    def add(known_before: tuple[Array, ...], new: tuple[Any, ...]) -> tuple[Any, None]:
+        equation, variance, target, size = new
+        kept, rows, answers = known_before
+        kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance, size)
         return (kept, rows, equations.answered(answers, target, leads, steps)), None
 
     before = state.variances, state.rows, state.targets
-    (kept, rows, answers), _ = lax.scan(add, before, (told, variances, targets))
+    (kept, rows, answers), _ = lax.scan(add, before, (told, variances, targets, sizes))
     return state._replace(variances=kept, rows=rows, targets=answers)
 
 
@@ -185,20 +207,25 @@ def absorb(
 ) -> tuple[InformationState, Info]:
     """The state with a measurement of any time, its R times `growth`, and its `Info`: one seen
     through a motion that has no way back, or (unless `exact`) without noise, is REJECTED."""
-    seen, difference, R = _sight(model, params, state, measurement)
+    seen, difference, R, size = sight(model, params, state.mean, state.time, measurement)
     mask = measurement.mask
     # No value decides here: runs that differ only in their values share what is not the targets.
-    noise, good = _noise(gaussian.mask_cov(R, mask), seen, exact)
+    noise, good = noise_of(gaussian.mask_cov(R, mask), seen, exact)
+    good &= ~jnp.any(jnp.isnan(state.variances))
     used = good & jnp.any(mask)
     usable, residual = jnp.where(good, seen, 0), jnp.where(good, difference, 0)
     told, apart = cholesky.forward(noise.unit, usable), cholesky.forward(noise.unit, residual)
+    sizes = None if size is None else summed(noise.unit, jnp.where(good, size, 0))
     spreads = jnp.where(used & mask, noise.variances * growth, jnp.inf)
     variances, rows, targets = state.variances, state.rows, state.targets
     for k in range(mask.shape[0]):  # apart from the targets it depends on no data: runs share it
-        variances, rows, leads, steps = equations.absorbed(variances, rows, told[k], spreads[k])
+        own = None if sizes is None else sizes[k]
+        variances, rows, leads, steps = equations.absorbed(
+            variances, rows, told[k], spreads[k], own
+        )
         targets = equations.answered(targets, apart[k], leads, steps)
     updated = state._replace(variances=variances, rows=rows, targets=targets)
-    info = _info(state, usable, residual, R * growth, measurement, good)
+    info = _info(state, usable, residual, R * growth, measurement, good, exact)
     # Variances outside of their domain are NaN here, and nothing is known from then on.
     is_broken = jnp.any(jnp.isnan(gaussian.mask_cov(R, mask)))
     updated = recentred(updated, used)
@@ -207,15 +234,17 @@ def absorb(
 
 def contribution(
     model: Model, params: Params, state: InformationState, measurement: Measurement
-) -> tuple[Array, Array, Array]:
-    """What one measurement says, as equations for `gathered`: whitened (m, n), targets (m,), and
-    variances (m,), infinite where nothing is said."""
-    seen, difference, R = _sight(model, params, state, measurement)
+) -> tuple[Array, Array, Array, Array]:
+    """What one measurement says, as equations for `gathered`: whitened (m, n), targets (m,),
+    variances (m,), infinite where nothing is said, and sizes (m, n)."""
+    seen, difference, R, size = sight(model, params, state.mean, state.time, measurement)
     mask = measurement.mask
-    noise, good = _noise(gaussian.mask_cov(R, mask), seen)
+    noise, good = noise_of(gaussian.mask_cov(R, mask), seen)
     told = cholesky.forward(noise.unit, jnp.where(good, seen, 0))
     targets = cholesky.forward(noise.unit, jnp.where(good, difference, 0))
-    return told, targets, jnp.where(good & mask, noise.variances, jnp.inf)
+    size = jnp.abs(seen) if size is None else size
+    sizes = summed(noise.unit, jnp.where(good, size, 0))
+    return told, targets, jnp.where(good & mask, noise.variances, jnp.inf), sizes
 
 
 def determined(state: InformationState) -> Array:
@@ -257,46 +286,6 @@ def _nothing(like: Array) -> dict[str, Array]:
     return dict(zip(("variances", "rows", "targets"), _unknown(jnp.zeros_like(like)), strict=True))
 
 
-def _sight(
-    model: Model, params: Params, state: InformationState, measurement: Measurement
-) -> tuple[Array, Array, Array]:
-    """H A (m, n), measured minus predicted at the reference (m,), R (m, m); zeros where masked."""
-    dtype = state.mean.dtype
-    mask = measurement.mask
-    A, c = affine_flow(model, params, state.time, measurement.time, dtype)
-    H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
-    checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    checks.shape("H", H, ("m", state.mean.shape[0]))
-    checks.shape("R", R, (H.shape[0],) * 2)
-    F_where, H_where = patterns(model)
-    there = matvec(A, state.mean, F_where)
-    there = there if c is None else there + c
-    difference = model.residual(measurement.value, matvec(H, there, H_where), measurement.sensor)
-    seen = jnp.where(mask[:, None], matmul(H, A, H_where), 0)
-    return seen, jnp.where(mask, difference, 0), R
-
-
-class _Noise(NamedTuple):
-    """R = L diag(variances) L': the unit lower triangular L, and variances (m,)."""
-
-    unit: cholesky.Factor
-    variances: Array
-
-
-def _noise(R: Array, seen: Array, exact: bool = False) -> tuple[_Noise, Array]:
-    """R taken apart, and whether the measurement is any good."""
-    m = R.shape[0]
-    found = cholesky.factor(R)
-    diagonal = jnp.diagonal(found.lower)
-    eye = jnp.eye(m, dtype=R.dtype)
-    unit = jnp.where(eye > 0, 1, matmul(found.lower, eye * found.reciprocal[None]))
-    fine = jnp.all(jnp.isfinite(seen))
-    psd = jnp.all(jnp.isfinite(R)) & jnp.all(jnp.diagonal(R) >= 0)
-    allowed = psd if exact else psd & found.full_rank
-    factor = cholesky.Factor(unit, jnp.ones(m, R.dtype), found.full_rank)
-    return _Noise(factor, jnp.square(diagonal)), fine & allowed
-
-
 def _info(
     state: InformationState,
     seen: Array,
@@ -304,14 +293,19 @@ def _info(
     R: Array,
     measurement: Measurement,
     good: Array,
+    exact: bool,
 ) -> Info:
     mask = measurement.mask
     is_determined = determined(state)
     leads = equations.leading(state.rows, seen)
     variances = jnp.where(is_determined, state.variances, 1)
     spread = matmul(leads * variances[None], leads.T)
+    size = None
+    if exact:  # then the rounding of what is known already would count as its spread
+        cov = equations.covariance(equations.inverse(state.rows), variances)
+        size = gaussian.sizes(cov, seen, gaussian.mask_cov(R, mask))
     innovation = gaussian.innovate(
-        difference - matvec(leads, state.targets), leads, spread + R, mask
+        difference - matvec(leads, state.targets), leads, spread + R, mask, size
     )
     used = is_determined & jnp.any(mask) & good
     return Info(

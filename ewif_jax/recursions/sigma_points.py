@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
-from ewif_jax.kernels import cholesky, sigma_points, symmetric
+from ewif_jax.kernels import cholesky, gaussian, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.linearise import patterns, predict_state
 from ewif_jax.models.model import Model, resolve
@@ -119,15 +119,21 @@ def measure_around(
         return model.residual(x, y, sensor)
 
     root = _root(cov, n) if still else None
-    lower = _fine_root(cov, n) if root is None else root.lower
+    exact = ~cholesky.factor(gaussian.mask_cov(jnp.asarray(R, mean.dtype), mask)).full_rank
+    lower = _fine_root(cov, n, exact) if root is None else root.lower
     predicted, line = _regressed(see, apart, points, params, mean, lower, still)
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
-    difference, R = apart(measurement.value, predicted), R + line.left_over
+    # After an exact measurement the points differ by rounding only, as the members of ensembles do.
+    rounding = gaussian.rounding_of(predicted)
+    is_spread = jnp.max(jnp.abs(line.slope), 1) > rounding
+    is_spread |= jnp.diagonal(line.left_over) > jnp.square(rounding)
+    left_over = jnp.where(is_spread[:, None] & is_spread[None], line.left_over, 0)
+    difference, R = apart(measurement.value, predicted), R + left_over
     if root is not None:
         H = unseen(sigma_points.slope_of(line, root), still)
         return updated(model, mean, cov, Compared(difference, H, R, mask))
-    slope = jnp.where(mask[:, None], line.slope, 0)
+    slope = jnp.where((mask & is_spread)[:, None], line.slope, 0)
     good = numbers(difference, matmul(slope, slope.T) + R, mask)
     difference, slope, R = (jnp.where(good, x, 0) for x in (difference, slope, R))
     mask = mask & good
@@ -140,10 +146,13 @@ def _root(cov: Array, n: int) -> cholesky.Factor:
     return cholesky.factor(symmetric.unpack(cov)[:n, :n])
 
 
-def _fine_root(cov: Array, n: int) -> Array:
+def _fine_root(cov: Array, n: int, exact: Array | bool = False) -> Array:
     """The factor's lower (n, n), not to be divided by: pivots near rounding are part of it, since a
-    position and a velocity of which little is known are correlated almost to one."""
-    return cholesky.factor(symmetric.unpack(cov), float(jnp.finfo(cov.dtype).eps)).lower
+    position and a velocity of which little is known are correlated almost to one. They are left out
+    where an `exact` measurement would weigh them like knowledge."""
+    eps = float(jnp.finfo(cov.dtype).eps)
+    size = jnp.where(exact, cholesky.negligible(n, cov.dtype) / eps, 1) * symmetric.diagonal(cov)
+    return cholesky.factor(symmetric.unpack(cov), eps, size).lower
 
 
 def _moved(

@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.kernels.growth import exponential
+from ewif_jax.kernels.trees import choose
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -22,7 +23,7 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
 from ewif_jax.streams import cast, float_dtype, given
-from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params
+from ewif_jax.types import Gaussian, Measurement, Numbers, Parameter, Params, Status
 
 
 def two_sided_ewif(
@@ -55,11 +56,13 @@ def two_sided_ewif(
 
     Returns:
         `Gaussian`: mean (K, n) and cov (K, n, n); NaN where the weighted measurements do not
-        determine the state. cov is (9), not the covariance of the error under model (3).
+        determine the state, or where one that counts cannot be used (an R that turns out singular
+        inside a trace, motion without a way back). cov is (9), not the covariance of the error
+        under model (3).
 
     Raises:
-        ValueError: tau <= 0, an unusable stream or prior, a prior without t0, a model that is not
-            linear.
+        ValueError: a tau that is not one number > 0, an unusable stream or prior, a prior without
+            t0, a model that is not linear.
 
     Reduces to: `batch_wls` with that weight; `ewif` at the newest time.
 
@@ -69,7 +72,7 @@ def two_sided_ewif(
     need_reversible(model, "two_sided_ewif")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_sensors(model, params, None, measurements)
-    checks.positive("tau", resolve(tau, params))
+    decay = checks.positive_number("tau", resolve(tau, params))
     refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
     refuse_one_way(model, params, "two_sided_ewif")
     dtype = float_dtype(measurements.value)
@@ -86,7 +89,7 @@ def two_sided_ewif(
         checks.require(t0 is not None, "t0", "the time of the prior", None)
         t0 = jnp.asarray(t0, dtype)
         prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
-    decay = jnp.asarray(resolve(tau, params), dtype)
+    decay = jnp.asarray(decay, dtype).reshape(())
     return _two_sided(model, params, cast(measurements, dtype), decay, prior, t0, times)
 
 
@@ -116,28 +119,39 @@ def _two_sided(
             model, params, state, time, exponential(jnp.abs(time - state.time), tau)
         )
 
-    def gathered(reverse: bool) -> InformationState:
-        """What the first (reversed: the last) 0, 1, ..., T measurements say, T + 1 states."""
+    def gathered(reverse: bool) -> tuple[InformationState, Array]:
+        """What the first (reversed: the last) 0, 1, ..., T measurements say, T + 1 states, and
+        which were not taken (T,)."""
         nothing = form.start(model, params, None, in_time.time[-1 if reverse else 0])
 
         def body(state: InformationState, measurement: Measurement):
             here = moved(state, measurement.time)
-            state, _ = form.absorb(model, params, here, measurement, 1.0)
-            return state, state
+            state, info = form.absorb(model, params, here, measurement, 1.0)
+            return state, (state, info.status == Status.REJECTED)
 
-        _, states = lax.scan(body, nothing, in_time, reverse=reverse)
+        _, (states, rejected) = lax.scan(body, nothing, in_time, reverse=reverse)
         one = jax.tree.map(lambda x: x[None], nothing)
         ends = (states, one) if reverse else (one, states)
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *ends), rejected
 
-    past, future = gathered(reverse=False), gathered(reverse=True)
+    (past, rejected), (future, _) = gathered(reverse=False), gathered(reverse=True)
     count = jnp.searchsorted(in_time.time, times, side="right")
+    # An estimate that lacks one of its measurements would be a wrong number without a status. Of
+    # those that could not be used the nearest on each side weighs most.
+    rejected &= jnp.any(in_time.mask, 1)
+    before = lax.cummax(jnp.where(rejected, in_time.time, -jnp.inf))
+    after = lax.cummin(jnp.where(rejected, in_time.time, jnp.inf), reverse=True)
+    before = jnp.concatenate([jnp.full(1, -jnp.inf, before.dtype), before])
+    after = jnp.concatenate([after, jnp.full(1, jnp.inf, after.dtype)])
 
     def smoothed_at(time: Array, k: Array) -> Gaussian:
         sources = [jax.tree.map(lambda x: x[k], side) for side in (past, future)]
         if prior is not None:
             sources.append(form.start(model, params, prior, t0))
         moved_here = [moved(source, time) for source in sources]
-        return form.estimate(form.recentred(reduce(form.joined, moved_here)))
+        found = form.estimate(form.recentred(reduce(form.joined, moved_here)))
+        nearest = jnp.minimum(time - before[k], after[k] - time)
+        lacking = jnp.isfinite(exponential(nearest, lax.stop_gradient(tau)))
+        return choose(lacking, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), found), found)
 
     return jax.vmap(smoothed_at)(times, count)

@@ -73,12 +73,7 @@ def against_oracle(name: str, given: Problem, trace: ej.Trace) -> tuple[int, str
     known |= name in ONE_LATE and (trace.info.status == Status.LATE_USED).sum() < 2
     if not known and (name not in ONE_STEP | ONE_LATE or any_late):
         return 0, ""
-    noisy = name not in WEIGHTED
-    inflate = None
-    if name == "fading":
-        inflate = lambda dt: float(given.params["fading"]) ** 2 if dt > 0 else 1.0  # noqa: E731
-    if name in WEIGHTED:
-        inflate = lambda dt: math.exp(dt / float(given.params["tau"]))  # noqa: E731
+    inflate, noisy = motion_of(name, given)
     compared, good = 0, 1e-6 if eps < 1e-10 else 1e-2
     for k in range(len(times)):
         if not given.stream.mask[k].any() or trace.info.status[k] == Status.TOO_LATE:
@@ -91,26 +86,74 @@ def against_oracle(name: str, given: Problem, trace: ej.Trace) -> tuple[int, str
         blurred = [filtered(given, rows, until, inflate, noisy, (rng, eps)) for _ in range(4)]
         if right.singular or any(b.singular for b in blurred):
             break  # an exact measurement of what is known exactly has no one answer
-        floor = (eps * 1e2 * (1 + np.abs(right.mean).max())) ** 2
-        sigma = np.sqrt(np.maximum(np.diag(right.cov), floor))
-        spread = max(np.abs((b.mean - right.mean) / sigma).max() for b in blurred)
-        spread_of_cov = max(
-            np.abs((b.cov - right.cov) / np.outer(sigma, sigma)).max() for b in blurred
-        )
-        if 300 * max(spread, spread_of_cov) > 0.1:
+        moments = [(b.mean, b.cov) for b in blurred]
+        wrong = off_by(trace.mean[k], trace.cov[k], (right.mean, right.cov), moments, eps)
+        if wrong is None:
             break  # beyond this rounding decides
         if not used[k]:
             if np.abs(given.stream.value[k]).max() > 1e15:
                 continue
             return compared, f"REJECTED without a reason at {k}"
-        error = np.abs((trace.mean[k] - right.mean) / sigma).max()
-        error_of_cov = np.abs((trace.cov[k] - right.cov) / np.outer(sigma, sigma)).max()
-        if not error <= good + 300 * spread:
-            return compared, f"mean off by {error:.2g} sigma at {k} (rounding: {spread:.1g})"
-        if not error_of_cov <= good + 300 * spread_of_cov:
-            return compared, f"cov off by {error_of_cov:.2g} at {k} (rounding: {spread_of_cov:.1g})"
+        if wrong:
+            return compared, f"{wrong} at {k}"
+        if trace.info.status[k] == Status.USED:
+            density, apart = trace.info.log_likelihood[k], [b.log_density for b in blurred]
+            allowed = 300 * np.abs(np.subtract(apart, right.log_density)).max()
+            allowed += good * (1 + abs(right.log_density))
+            if not abs(density - right.log_density) <= allowed:
+                return compared, f"log density {density:.4g} for {right.log_density:.4g} at {k}"
         compared += 1
     return compared, ""
+
+
+def expected_density(name: str, given: Problem) -> tuple[float, float] | None:
+    """The average log density of the rows by the oracle, and what rounding may change; None if
+    there are late or singular ones, or rounding decides."""
+    if name not in IN_ORDER | EXACT_LATE | WEIGHTED | {"fading"} or given.traits["late"] != "none":
+        return None
+    eps = float(np.finfo(given.stream.time.dtype).eps)
+    times = np.asarray(given.stream.time, float)
+    rows = np.flatnonzero(np.asarray(given.stream.mask).any(1))
+    rng, totals = np.random.default_rng(1), []
+    for blur in (None, (rng, eps), (rng, eps), (rng, eps)):
+        found = [
+            filtered(given, rows[: k + 1], times[rows[k]], *motion_of(name, given), blur)
+            for k in range(len(rows))
+        ]
+        if any(x.singular for x in found):
+            return None
+        totals.append(sum(x.log_density for x in found) / max(len(rows), 1))
+    allowed = 300 * np.abs(np.subtract(totals[1:], totals[0])).max()
+    return (totals[0], allowed + 1e-6 * (1 + abs(totals[0]))) if allowed < 0.1 else None
+
+
+def motion_of(name: str, given: Problem) -> tuple[Any, bool]:
+    """`inflate` and `noisy` of the oracle of a filter."""
+    if name == "fading":
+        return (lambda dt: float(given.params["fading"]) ** 2 if dt > 0 else 1.0), True
+    if name in WEIGHTED:
+        return (lambda dt: math.exp(dt / float(given.params["tau"]))), False
+    return None, True
+
+
+def off_by(mean: Any, cov: Any, right: Any, blurred: Any, eps: float) -> str | None:
+    """What is wrong with a mean and covariance; None if rounding decides, which moves what is
+    `right` to what is `blurred`."""
+    good = 1e-6 if eps < 1e-10 else 1e-2
+    floor = (eps * 1e2 * (1 + np.abs(right[0]).max())) ** 2
+    sigma = np.sqrt(np.maximum(np.diag(right[1]), floor))
+    sizes = np.outer(sigma, sigma)
+    spread = max(np.abs((b[0] - right[0]) / sigma).max() for b in blurred)
+    spread_of_cov = max(np.abs((b[1] - right[1]) / sizes).max() for b in blurred)
+    if not 300 * max(spread, spread_of_cov) <= 0.1:
+        return None
+    error = np.abs((mean - right[0]) / sigma).max()
+    error_of_cov = np.abs((cov - right[1]) / sizes).max()
+    if not error <= good + 300 * spread:
+        return f"mean off by {error:.2g} sigma (rounding: {spread:.1g})"
+    if not error_of_cov <= good + 300 * spread_of_cov:
+        return f"cov off by {error_of_cov:.2g} (rounding: {spread_of_cov:.1g})"
+    return ""
 
 
 def rows_with_an_answer(given: Problem, trace: ej.Trace) -> int:

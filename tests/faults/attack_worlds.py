@@ -12,49 +12,52 @@ import numpy as np
 import ewif_jax as ej
 
 
-def _motion(xp: Any, p: Any, dt: Any) -> Any:
+def motion(xp: Any, p: Any, dt: Any) -> Any:
     """F (n, n): real modes `rate` in the axes `basis`; a mode that is `dead` forgets at once."""
     decay = xp.where(p["dead"] & (dt != 0), 0.0, xp.exp(p["rate"] * dt))
     return (p["basis"] * decay[None, :]) @ p["inverse"]
 
 
-def _integral(xp: Any, rate: Any, dt: Any) -> Any:
+def integral(xp: Any, rate: Any, dt: Any) -> Any:
     """The integral of exp(rate s) over s from 0 to dt."""
     still = rate == 0
     safe = xp.where(still, 1.0, rate)
     return xp.where(still, dt, xp.expm1(safe * dt) / safe)
 
 
-def _noise(xp: Any, p: Any, dt: Any) -> Any:
+def noise(xp: Any, p: Any, dt: Any) -> Any:
     dead = p["dead"]
-    grown = _integral(xp, p["rate"][:, None] + p["rate"][None, :], dt)
+    grown = integral(xp, p["rate"][:, None] + p["rate"][None, :], dt)
     both, either = dead[:, None] & dead[None, :], dead[:, None] | dead[None, :]
     moved = xp.where(dt > 0, 1.0, 0.0)
     modal = p["density"] * xp.where(both, moved, xp.where(either, 0.0, grown))
     return p["basis"] @ modal @ p["basis"].T
 
 
-def _push(xp: Any, p: Any, dt: Any) -> Any:
+def push(xp: Any, p: Any, dt: Any) -> Any:
     moved = xp.where(dt > 0, 1.0, 0.0)
-    return p["basis"] @ (p["push"] * xp.where(p["dead"], moved, _integral(xp, p["rate"], dt)))
+    return p["basis"] @ (p["push"] * xp.where(p["dead"], moved, integral(xp, p["rate"], dt)))
 
 
 def linear_world() -> ej.Model:
     return ej.linear_model(
-        lambda p, t0, t1: _motion(jnp, p, t1 - t0),
+        lambda p, t0, t1: motion(jnp, p, t1 - t0),
         lambda p, sensor, t: p["H"][sensor],
         lambda p, sensor, t: p["R"][sensor],
-        lambda p, t0, t1: _noise(jnp, p, t1 - t0),
-        lambda p, t0, t1: _push(jnp, p, t1 - t0),
+        lambda p, t0, t1: noise(jnp, p, t1 - t0),
+        lambda p, t0, t1: push(jnp, p, t1 - t0),
     )
+
+
+def bend(xp: Any, seen: Any) -> Any:
+    return seen + 0.8 * xp.sin(seen)
 
 
 def bent_world() -> ej.Model:
     """The same motion, seen by sensors that bend what they see."""
 
     def observe(p: Any, x: Any, sensor: Any, t: Any) -> Any:
-        seen = p["H"][sensor] @ x
-        return seen + 0.8 * jnp.sin(seen)
+        return bend(jnp, p["H"][sensor] @ x)
 
     linear = linear_world()
     return ej.Model(
@@ -151,8 +154,8 @@ def _values(rng: Any, p: Any, prior: Any, time: Any, sensor: Any, kind: str) -> 
     x = rng.multivariate_normal(prior.mean, prior.cov, method="svd")
     for k in order:
         dt = time[k] - now
-        cov = _noise(np, p, dt)
-        x = _motion(np, p, dt) @ x + _push(np, p, dt)
+        cov = noise(np, p, dt)
+        x = motion(np, p, dt) @ x + push(np, p, dt)
         x = x + rng.multivariate_normal(np.zeros(len(x)), cov, method="svd")
         error = rng.multivariate_normal(np.zeros(value.shape[1]), p["R"][sensor[k]], method="svd")
         value[k], now = p["H"][sensor[k]] @ x + error, time[k]
@@ -164,11 +167,12 @@ def _values(rng: Any, p: Any, prior: Any, time: Any, sensor: Any, kind: str) -> 
 
 
 class Expected(NamedTuple):
-    """mean, cov; whether an update had a singular innovation covariance."""
+    """mean, cov; whether an innovation covariance was singular; the log density of the last row."""
 
     mean: np.ndarray
     cov: np.ndarray
     singular: bool
+    log_density: float
 
 
 def filtered(
@@ -187,7 +191,7 @@ def filtered(
     p = {k: np.asarray(v, float if k != "dead" else bool) for k, v in given.params.items()}
     x, P = (np.asarray(v, float) for v in given.prior)
     times = np.asarray(given.stream.time, float)
-    singular, now = False, 0.0
+    now, density = 0.0, 0.0
 
     def off(a: Any) -> Any:
         return a if blur is None else a * (1 + blur[1] * blur[0].uniform(-1, 1, np.shape(a)))
@@ -195,10 +199,10 @@ def filtered(
     for k in [*sorted(rows, key=lambda row: times[row]), None]:
         time = until if k is None else times[k]
         dt = time - now
-        F = off(_motion(np, p, dt))
+        F = off(motion(np, p, dt))
         P = F @ P @ F.T * (1.0 if inflate is None else inflate(dt))
-        P = off(P + _noise(np, p, dt) if noisy else P)
-        P, x, now = (P + P.T) / 2, off(F @ x + _push(np, p, dt)), time
+        P = off(P + noise(np, p, dt) if noisy else P)
+        P, x, now = (P + P.T) / 2, off(F @ x + push(np, p, dt)), time
         if k is None:
             break
         seen, s = given.stream.mask[k], given.stream.sensor[k]
@@ -206,9 +210,11 @@ def filtered(
         S = H @ P @ H.T + R
         size = np.sqrt(np.maximum(np.diag(S), 1e-300))
         if np.linalg.eigvalsh(S / np.outer(size, size)).min() < 1e-9 or size.min() < 1e-12:
-            return Expected(x, P, True)
+            return Expected(x, P, True, density)
         K = np.linalg.solve(S, H @ P).T
-        x = off(x + K @ (np.asarray(given.stream.value, float)[k][seen] - H @ x))
+        nu = np.asarray(given.stream.value, float)[k][seen] - H @ x
+        density = -(nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
+        x = off(x + K @ nu)
         left = np.eye(len(x)) - K @ H
         P = left @ P @ left.T + K @ R @ K.T
-    return Expected(x, P, singular)
+    return Expected(x, P, False, density)

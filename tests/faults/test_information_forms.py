@@ -96,3 +96,34 @@ def test_the_gradient_in_tau_is_finite_for_every_gap(dtype):
         both = jax.jit(jax.vmap(loss, (None, 0)))
         slope = (both(tau + h, gaps) - both(tau - h, gaps)) / (2 * h)
         np.testing.assert_allclose(reverse, slope, rtol=1e-4, atol=1e-5)
+
+
+def test_the_rounding_of_a_zero_is_no_knowledge():
+    """Motion over no time that is the identity but for rounding, and a sensor that does not see the
+    first state: of the blocks of `run_parallel`, which know nothing at first, it was believed."""
+    basis = np.array([[0.2, -0.9, 0.5], [1.3, 0.3, -0.1], [-0.4, 0.7, 1.1]])
+    inverse, rates = np.linalg.inv(basis), np.array([-0.3, -0.1, -0.6])
+
+    def F(params, a, b):
+        return (basis * jnp.exp(rates * (b - a))[None]) @ inverse
+
+    H = np.array([[0.0, 0.7, -1.1], [0.3, 2.7, 0.4]])
+    R = np.array([[0.016, 0.001], [0.001, 0.002]])
+    time, value = np.arange(0.5, 6.5, 0.5), np.random.default_rng(2).normal(size=(12, 2))
+    prior = ej.Gaussian(np.ones(3), 50 * np.eye(3))
+    model = ej.linear_model(F, H, R)
+    trace = ej.run_parallel(model, None, ej.stream(time, value), tau=2.0, prior=prior, t0=0.0)
+
+    def back(s):
+        return (basis * np.exp(-rates * s)) @ inverse
+
+    whiten = np.linalg.inv(np.linalg.cholesky(R))
+    for k in (3, 4, 7, 11):
+        now, half = time[k], lambda t, now=time[k]: np.exp((t - now) / 4)
+        rows = [half(0.0) * back(now) / np.sqrt(50)]
+        targets = [half(0.0) * np.ones(3) / np.sqrt(50)]
+        for t, z in zip(time[: k + 1], value, strict=False):
+            rows.append(half(t) * whiten @ H @ back(now - t))
+            targets.append(half(t) * whiten @ z)
+        right = np.linalg.lstsq(np.vstack(rows), np.concatenate(targets))[0]
+        np.testing.assert_allclose(trace.mean[k], right, rtol=1e-9, atol=1e-9)

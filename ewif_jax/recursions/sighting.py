@@ -1,0 +1,75 @@
+"""What one measurement says of the present state, as equations, and what of it is only rounding."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ewif_jax import checks
+from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.kernels import cholesky
+from ewif_jax.models import Model
+from ewif_jax.models.linearise import affine_flow, observation, patterns
+from ewif_jax.types import Measurement, Params
+
+
+def still_at_once(model: Model, F: Array, at_once: Array) -> Array:
+    """F, the identity to the last bit over no time: where nothing is known of a direction yet, the
+    rounding of a zero would be taken for what a measurement says of it. Where the zeros of F are
+    known it is that already."""
+    if patterns(model)[0] is not None:
+        return F
+    return jnp.where(at_once, jnp.eye(F.shape[0], dtype=F.dtype), F)
+
+
+def sight(
+    model: Model, params: Params, mean: Array, now: Array, measurement: Measurement
+) -> tuple[Array, Array, Array, Array | None]:
+    """H A (m, n), measured minus what `mean` (n,) at time `now` predicts (m,), R (m, m), and how
+    large the terms of H A are, (m, n), None where it is known which are zero; zeros where masked.
+    """
+    dtype = mean.dtype
+    mask = measurement.mask
+    A, c = affine_flow(model, params, now, measurement.time, dtype)
+    H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
+    checks.shape("measurement.value", measurement.value, (H.shape[0],))
+    checks.shape("H", H, ("m", mean.shape[0]))
+    checks.shape("R", R, (H.shape[0],) * 2)
+    F_where, H_where = patterns(model)
+    A = still_at_once(model, A, measurement.time == now)
+    there = matvec(A, mean, F_where)
+    there = there if c is None else there + c
+    difference = model.residual(measurement.value, matvec(H, there, H_where), measurement.sensor)
+    seen = jnp.where(mask[:, None], matmul(H, A, H_where), 0)
+    size = None
+    if F_where is None:
+        size = jnp.where(mask[:, None], matmul(jnp.abs(H), jnp.abs(A), H_where), 0)
+    return seen, jnp.where(mask, difference, 0), R, size
+
+
+def summed(unit: cholesky.Factor, sizes: Array) -> Array:
+    """How large the terms (m, n) of whitened equations are, of which the terms were `sizes`."""
+    eye = jnp.eye(sizes.shape[0], dtype=sizes.dtype)
+    adding = jnp.where(eye > 0, 1, -jnp.abs(unit.lower))
+    return cholesky.forward(unit._replace(lower=adding), sizes)
+
+
+class Noise(NamedTuple):
+    """R = L diag(variances) L': the unit lower triangular L, and variances (m,)."""
+
+    unit: cholesky.Factor
+    variances: Array
+
+
+def noise_of(R: Array, seen: Array, exact: bool = False) -> tuple[Noise, Array]:
+    """R taken apart, and whether the measurement is any good."""
+    m = R.shape[0]
+    found = cholesky.factor(R)
+    diagonal = jnp.diagonal(found.lower)
+    eye = jnp.eye(m, dtype=R.dtype)
+    unit = jnp.where(eye > 0, 1, matmul(found.lower, eye * found.reciprocal[None]))
+    fine = jnp.all(jnp.isfinite(seen))
+    psd = jnp.all(jnp.isfinite(R)) & jnp.all(jnp.diagonal(R) >= 0)
+    allowed = psd if exact else psd & found.full_rank
+    factor = cholesky.Factor(unit, jnp.ones(m, R.dtype), found.full_rank)
+    return Noise(factor, jnp.square(diagonal)), fine & allowed
