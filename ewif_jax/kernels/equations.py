@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from ewif_jax.fast.batched import kept_apart, kernel, stacked, stage, total
 from ewif_jax.fast.sparse import Pattern, by_row
@@ -217,7 +217,11 @@ def _taken_out(
 ) -> tuple[Array, Array, Array]:
     part = lead[None] * row
     rest = rest - part
-    return row + step[None] * rest, rest, jnp.maximum(scale, jnp.abs(part))
+    taken = row + step[None] * rest
+    # What an exact equation replaces leaves rounding, which the next one would take for its own.
+    rounding = 8 * (len(row) + 1) * float(jnp.finfo(row.dtype).eps) * jnp.abs(row)
+    left = lax.stop_gradient(jnp.where(jnp.abs(taken) < rounding, taken, 0))
+    return taken - left, rest, jnp.maximum(scale, jnp.abs(part))
 
 
 @kernel
