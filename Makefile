@@ -1,13 +1,24 @@
 # `make demo` and `make test` do everything on a machine that has Python >= 3.11 and make.
 PYTHON ?= python3
-BIN := .venv/bin
-STUDY := .venv/.study
-DEV := .venv/.dev
+VENV ?= .venv
+BIN := $(VENV)/bin
+STUDY := $(VENV)/.study
+DEV := $(VENV)/.dev
+# PYTHON given by hand is what runs: it is looked for in pyenv's versions too, and an environment of
+# another version is made again.
+ifeq ($(origin PYTHON), command line)
+override PYTHON := $(or $(shell python3 .ci/interpreter.py $(PYTHON)),$(PYTHON))
+ifneq ($(wildcard $(BIN)/python),)
+ifneq ($(shell $(PYTHON) -V), $(shell $(BIN)/python -V))
+.PHONY: $(BIN)/python
+endif
+endif
+endif
 # Modules are compiled when they are first imported: most of what is installed never is.
 PIP := $(BIN)/python -m pip install --quiet --no-compile
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all lint types check bench reproduce clean
+.PHONY: demo test test-all test-newest lint types check bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
@@ -17,6 +28,9 @@ test: $(DEV)  ## all tests, on all cores
 
 test-all: $(DEV)  ## the slow ones too
 	$(PYTEST) --all
+
+test-newest:  ## all tests on the newest Python here, with the newest JAX, in .venv-newest
+	newest=$$($(PYTHON) .ci/interpreter.py newest) && $(MAKE) test VENV=.venv-newest PYTHON="$$newest"
 
 lint: $(DEV)
 	$(BIN)/ruff check .
@@ -36,7 +50,7 @@ bench: $(DEV)
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed"'
-	$(PYTHON) -m venv .venv
+	$(PYTHON) -m venv --clear $(VENV)
 
 $(STUDY): $(BIN)/python pyproject.toml
 	$(PIP) -e ".[study]"
@@ -47,4 +61,4 @@ $(DEV): $(BIN)/python pyproject.toml
 	touch $@ $(STUDY)
 
 clean:
-	rm -rf .venv build dist results
+	rm -rf .venv .venv-newest build dist results

@@ -8,6 +8,7 @@ ever unknown again. The targets keep what re-centring leaves over, rounding of t
 far from the origin that is more than what one measurement changes.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import Pattern
 from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.trees import choose
@@ -62,29 +64,46 @@ def transport(
     params: Params,
     state: InformationState,
     time: Array,
-    growth: Array | float,
+    fade: Callable[[Array], Array] | None = None,
     noise: Array | None = None,
 ) -> InformationState:
-    """The state at `time`, in either direction: variances times `growth`, plus those of `noise`
-    (n, n), a matrix L of which L L' is the process noise (at `time`)."""
+    """The state at `time`, in either direction: variances as `fade` makes them (None: as they are),
+    plus those of `noise` (n, n), a matrix L of which L L' is the process noise (at `time`)."""
     dtype = state.mean.dtype
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
     where = patterns(model)[0]
-    mean = matvec(F, state.mean, where)
-    mean = mean if c is None else mean + c
-    faded = state._replace(time=time, variances=grown(state.variances, growth))
+    mean, rest = _moved_reference(F, c, state.mean, where)
+    variances = state.variances if fade is None else fade(state.variances)
+    faded = state._replace(time=time, mean=mean, variances=variances)
+    back, _ = affine_flow(model, params, time, state.time, dtype)
     if noise is None and where is not None and equations.is_upper(where):
-        back, _ = affine_flow(model, params, time, state.time, dtype)
         rows, diagonal = equations.carried(faded.rows, back, where)
-        return faded._replace(
-            mean=mean,
+        there = faded._replace(
             variances=_over(faded.variances, diagonal),
             rows=rows,
             targets=faded.targets / diagonal,
         )
-    back, _ = affine_flow(model, params, time, state.time, dtype)
-    return moved(faded, F, back, noise)._replace(mean=mean)
+    else:
+        there = moved(faded, F, back, noise)
+    return there._replace(targets=there.targets + equations.times(there.rows, rest))
+
+
+def _moved_reference(
+    F: Array, c: Array | None, mean: Array, where: Pattern | None
+) -> tuple[Array, Array]:
+    """F mean + c, and what rounding left of it over.
+
+    Over a short interval a mean far from the origin moves by less than it is rounded by: 3 m/s for
+    0.01 s is half of what float32 resolves at 1e6 m, and a target there would stand still.
+    """
+    n = mean.shape[0]
+    if where is not None:
+        where = tuple((*row[:k], True, *row[k + 1 :]) for k, row in enumerate(where))
+    change = matvec(F - jnp.eye(n, dtype=F.dtype), mean, where)
+    change = change if c is None else change + c
+    there = mean + change
+    return there, change - (there - mean)
 
 
 def moved(

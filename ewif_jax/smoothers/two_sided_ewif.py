@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.kernels.growth import exponential
+from ewif_jax.kernels.growth import decayed
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -112,9 +112,8 @@ def _two_sided(
         )
 
     def moved(state: InformationState, time: Array) -> InformationState:
-        return form.transport(
-            model, params, state, time, exponential(jnp.abs(time - state.time), tau)
-        )
+        age = jnp.abs(time - state.time)
+        return form.transport(model, params, state, time, lambda v: decayed(v, age, tau))
 
     def gathered(reverse: bool) -> InformationState:
         """What the first (reversed: the last) 0, 1, ..., T measurements say, T + 1 states."""
