@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STUDY := $(VENV)/.study
 DEV := $(VENV)/.dev
+TEST := $(VENV)/.test
 # PYTHON given by hand is what runs: it is looked for in pyenv's versions too, and an environment of
 # another version is made again.
 ifeq ($(origin PYTHON), command line)
@@ -16,9 +17,12 @@ endif
 endif
 # Modules are compiled when they are first imported: most of what is installed never is.
 PIP := $(BIN)/python -m pip install --quiet --no-compile
+# A quarter of the tests, without the extras: every entry and every kind of input, what filters are
+# built of, and some filters whole.
+QUARTER := tests/oracles tests/test_checks.py
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all test-newest lint types check bench reproduce clean
+.PHONY: demo test test-all test-newest test-quarter lint types check bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
@@ -31,6 +35,9 @@ test-all: $(DEV)  ## the slow ones too
 
 test-newest:  ## all tests on the newest Python here, with the newest JAX, in .venv-newest
 	newest=$$($(PYTHON) .ci/interpreter.py newest) && $(MAKE) test VENV=.venv-newest PYTHON="$$newest"
+
+test-quarter: $(TEST)
+	$(PYTEST) $(QUARTER)
 
 lint: $(DEV)
 	$(BIN)/ruff check .
@@ -58,7 +65,11 @@ $(STUDY): $(BIN)/python pyproject.toml
 
 $(DEV): $(BIN)/python pyproject.toml
 	$(PIP) -e ".[dev]"
-	touch $@ $(STUDY)
+	touch $@ $(STUDY) $(TEST)
+
+$(TEST): $(BIN)/python pyproject.toml
+	$(PIP) -e ".[test]"
+	touch $@
 
 clean:
 	rm -rf .venv .venv-newest build dist results
