@@ -17,8 +17,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.fast.sparse import Pattern
-from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
+from ewif_jax.kernels import cholesky, equations, gaussian, remainders, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
@@ -73,7 +72,7 @@ def transport(
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
     where = patterns(model)[0]
-    mean, rest = _moved_reference(F, c, state.mean, where)
+    mean, rest = remainders.moved(F, c, state.mean, where)
     variances = state.variances if fade is None else fade(state.variances)
     faded = state._replace(time=time, mean=mean, variances=variances)
     back, _ = affine_flow(model, params, time, state.time, dtype)
@@ -87,23 +86,6 @@ def transport(
     else:
         there = moved(faded, F, back, noise)
     return there._replace(targets=there.targets + equations.times(there.rows, rest))
-
-
-def _moved_reference(
-    F: Array, c: Array | None, mean: Array, where: Pattern | None
-) -> tuple[Array, Array]:
-    """F mean + c, and what rounding left of it over.
-
-    Over a short interval a mean far from the origin moves by less than it is rounded by: 3 m/s for
-    0.01 s is half of what float32 resolves at 1e6 m, and a target there would stand still.
-    """
-    n = mean.shape[0]
-    if where is not None:
-        where = tuple((*row[:k], True, *row[k + 1 :]) for k, row in enumerate(where))
-    change = matvec(F - jnp.eye(n, dtype=F.dtype), mean, where)
-    change = change if c is None else change + c
-    there = mean + change
-    return there, change - (there - mean)
 
 
 def moved(
