@@ -10,7 +10,6 @@ usage: PYTHONPATH=tests python tests/faults/single_precision.py [--steps N] [--o
 import argparse
 import platform
 import sys
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,14 +130,21 @@ def compared(row: Row, world: World, steps: int) -> Found:
     return Found(found / usual, 0.0, abs(np.exp(np.mean(np.log(ratio))) - 1), variance.min(), lost)
 
 
-def table(names: list[str], steps: int) -> Iterator[str]:
-    """Its lines."""
-    yield f"| estimator | {' | '.join(WORLDS)} |"
-    yield f"|---|{'---|' * len(WORLDS)}"
-    for row in ROWS:
-        if not names or row.name in names:
-            cells = [cell(row, world, steps) for world in WORLDS.values()]
-            yield f"| `{row.name}` | {' | '.join(cells)} |"
+def write(rows: dict[str, str], steps: int) -> None:
+    """Puts rows into the page, beside those of other estimators that it has."""
+    page = PAGE.read_text() if PAGE.exists() else f"{BEGIN}\n{END}\n"
+    before, _, rest = page.partition(BEGIN)
+    old, _, after = rest.partition(END)
+    there = {line.split("`")[1]: line for line in old.splitlines() if line.startswith("| `")}
+    what = f"ewif_jax {version('ewif_jax')}, jax {jax.__version__}, {platform.machine()}"
+    lines = [
+        f"{steps} steps, seed {SEED}; {what}.",
+        "",
+        f"| estimator | {' | '.join(WORLDS)} |",
+        f"|---|{'---|' * len(WORLDS)}",
+        *(line for row in ROWS if (line := {**there, **rows}.get(row.name))),
+    ]
+    PAGE.write_text("\n".join([before + BEGIN, *lines, END]) + after)
 
 
 def cell(row: Row, world: World, steps: int) -> str:
@@ -160,17 +166,17 @@ def main() -> None:
     options = argparse.ArgumentParser()
     options.add_argument("--steps", type=int, default=100_000)
     options.add_argument("--only", nargs="*", default=[])
-    options.add_argument("--write", action="store_true", help=f"the table into {PAGE.name}")
+    options.add_argument("--write", action="store_true", help=f"into {PAGE.name}")
     asked = options.parse_args()
     jax.config.update("jax_enable_x64", True)
-    what = f"ewif_jax {version('ewif_jax')}, jax {jax.__version__}, {platform.machine()}"
-    lines = [f"{asked.steps} steps, seed {SEED}; {what}.", ""]
-    for line in table(asked.only, asked.steps):
-        print(line, flush=True)
-        lines.append(line)
-    if asked.write:
-        before, _, rest = PAGE.read_text().partition(BEGIN)
-        PAGE.write_text("\n".join([before + BEGIN, *lines, END]) + rest.partition(END)[2])
+    for row in ROWS:
+        if not asked.only or row.name in asked.only:
+            cells = [cell(row, world, asked.steps) for world in WORLDS.values()]
+            line = f"| `{row.name}` | {' | '.join(cells)} |"
+            print(line, flush=True)
+            if asked.write:
+                write({row.name: line}, asked.steps)
+            jax.clear_caches()
 
 
 if __name__ == "__main__":
