@@ -17,9 +17,14 @@ endif
 endif
 # Modules are compiled when they are first imported: most of what is installed never is.
 PIP := $(BIN)/python -m pip install --quiet --no-compile
-# A quarter of the tests, without the extras: every entry and every kind of input, what filters are
-# built of, and some filters whole.
-QUARTER := tests/oracles tests/test_checks.py
+# A quarter of the tests and more, in two minutes and without the extras: what another Python, NumPy or
+# JAX breaks first (imports, every kind of input at every entry, pickling), oracles and closed forms.
+QUARTER := tests/oracles tests/test_architecture.py tests/test_checks.py tests/test_models.py \
+   tests/test_sensors.py tests/test_face.py tests/faults/test_times.py \
+   tests/faults/test_stream_inputs.py tests/faults/test_values_out_of_domain.py \
+   tests/faults/test_every_run_every_entry.py tests/faults/test_pickling.py \
+   tests/faults/test_singular_priors.py tests/papers/test_yoder_closed_forms.py \
+   tests/papers/test_anderson.py
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test test-all test-newest test-quarter lint types check bench reproduce clean
