@@ -4,7 +4,6 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STUDY := $(VENV)/.study
 DEV := $(VENV)/.dev
-TEST := $(VENV)/.test
 # PYTHON given by hand is what runs: it is looked for in pyenv's versions too, and an environment of
 # another version is made again.
 ifeq ($(origin PYTHON), command line)
@@ -17,8 +16,8 @@ endif
 endif
 # Modules are compiled when they are first imported: most of what is installed never is.
 PIP := $(BIN)/python -m pip install --quiet --no-compile
-# A quarter of the tests and more, in two minutes and without the extras: what another Python, NumPy or
-# JAX breaks first (imports, every kind of input at every entry, pickling), oracles and closed forms.
+# A quarter of the tests and more, in two minutes: what another Python, NumPy or JAX breaks first
+# (imports, every kind of input at every entry, pickling), oracles and closed forms.
 QUARTER := tests/oracles tests/test_architecture.py tests/test_checks.py tests/test_models.py \
    tests/test_sensors.py tests/test_face.py tests/faults/test_times.py \
    tests/faults/test_stream_inputs.py tests/faults/test_values_out_of_domain.py \
@@ -41,7 +40,7 @@ test-all: $(DEV)  ## the slow ones too
 test-newest:  ## all tests on the newest Python here, with the newest JAX, in .venv-newest
 	newest=$$($(PYTHON) .ci/interpreter.py newest) && $(MAKE) test VENV=.venv-newest PYTHON="$$newest"
 
-test-quarter: $(TEST)
+test-quarter: $(DEV)
 	$(PYTEST) $(QUARTER)
 
 lint: $(DEV)
@@ -70,11 +69,7 @@ $(STUDY): $(BIN)/python pyproject.toml
 
 $(DEV): $(BIN)/python pyproject.toml
 	$(PIP) -e ".[dev]"
-	touch $@ $(STUDY) $(TEST)
-
-$(TEST): $(BIN)/python pyproject.toml
-	$(PIP) -e ".[test]"
-	touch $@
+	touch $@ $(STUDY)
 
 clean:
 	rm -rf .venv .venv-newest build dist results
