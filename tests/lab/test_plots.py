@@ -23,7 +23,7 @@ def seen():
     truth = np.stack([time, 8 * np.sin(time / 8)], 1)
     value = truth + random.normal(size=truth.shape)
     value[20] = np.nan
-    value[25] += 60
+    value[24] += 60  # one that arrives in time
     arrival = time + np.where(np.arange(STEPS) % 3 == 1, 2.5, 0)
     stream = ej.stream(time, value, np.arange(STEPS) % 2, arrival=arrival)
     order = ej.arrival_order(arrival)
