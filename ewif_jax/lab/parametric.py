@@ -62,8 +62,9 @@ class Simulate:
         return frozenset(inspect.signature(self.builder).parameters)
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, Simulate) and self.builder is other.builder
-        return same and self._key == other._key
+        if not isinstance(other, Simulate):
+            return False
+        return self.builder is other.builder and self._key == other._key
 
     def __hash__(self) -> int:
         return hash((self.builder, self._key))

@@ -13,7 +13,7 @@ plots = ej.lab.plots
 MODEL = ej.models.constant_velocity(
     dims=2, q=0.3, sensors=[ej.models.position_sensor(1.0, dims=2)] * 2
 )
-STEPS = 30
+STEPS = 60
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def seen():
     truth = np.stack([time, 8 * np.sin(time / 8)], 1)
     value = truth + random.normal(size=truth.shape)
     value[20] = np.nan
-    value[24] += 60  # one that arrives in time
+    value[59] += 60  # one that arrives in time
     arrival = time + np.where(np.arange(STEPS) % 3 == 1, 2.5, 0)
     stream = ej.stream(time, value, np.arange(STEPS) % 2, arrival=arrival)
     order = ej.arrival_order(arrival)
