@@ -1,13 +1,32 @@
 # `make demo` and `make test` do everything on a machine that has Python >= 3.11 and make.
 PYTHON ?= python3
-BIN := .venv/bin
-STUDY := .venv/.study
-DEV := .venv/.dev
+VENV ?= .venv
+BIN := $(VENV)/bin
+STUDY := $(VENV)/.study
+DEV := $(VENV)/.dev
+# PYTHON given by hand is what runs: it is looked for in pyenv's versions too, and an environment of
+# another version is made again.
+ifeq ($(origin PYTHON), command line)
+override PYTHON := $(or $(shell python3 .ci/interpreter.py $(PYTHON)),$(PYTHON))
+ifneq ($(wildcard $(BIN)/python),)
+ifneq ($(shell $(PYTHON) -V), $(shell $(BIN)/python -V))
+.PHONY: $(BIN)/python
+endif
+endif
+endif
 # Modules are compiled when they are first imported: most of what is installed never is.
 PIP := $(BIN)/python -m pip install --quiet --no-compile
+# A quarter of the tests and more, in two minutes: what another Python, NumPy or JAX breaks first
+# (imports, every kind of input at every entry, pickling), oracles and closed forms.
+QUARTER := tests/oracles tests/test_architecture.py tests/test_checks.py tests/test_models.py \
+   tests/test_sensors.py tests/test_face.py tests/faults/test_times.py \
+   tests/faults/test_stream_inputs.py tests/faults/test_values_out_of_domain.py \
+   tests/faults/test_every_run_every_entry.py tests/faults/test_pickling.py \
+   tests/faults/test_singular_priors.py tests/papers/test_yoder_closed_forms.py \
+   tests/papers/test_anderson.py
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all lint types check bench reproduce clean
+.PHONY: demo test test-all test-newest test-quarter lint types check bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
@@ -17,6 +36,12 @@ test: $(DEV)  ## all tests, on all cores
 
 test-all: $(DEV)  ## the slow ones too
 	$(PYTEST) --all
+
+test-newest:  ## all tests on the newest Python here, with the newest JAX, in .venv-newest
+	newest=$$($(PYTHON) .ci/interpreter.py newest) && $(MAKE) test VENV=.venv-newest PYTHON="$$newest"
+
+test-quarter: $(DEV)
+	$(PYTEST) $(QUARTER)
 
 lint: $(DEV)
 	$(BIN)/ruff check .
@@ -36,7 +61,7 @@ bench: $(DEV)
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed"'
-	$(PYTHON) -m venv .venv
+	$(PYTHON) -m venv --clear $(VENV)
 
 $(STUDY): $(BIN)/python pyproject.toml
 	$(PIP) -e ".[study]"
@@ -47,4 +72,4 @@ $(DEV): $(BIN)/python pyproject.toml
 	touch $@ $(STUDY)
 
 clean:
-	rm -rf .venv build dist results
+	rm -rf .venv .venv-newest build dist results

@@ -33,7 +33,7 @@ from ewif_jax.analysis.pcrlb import pcrlb, pcrlb_late
 from ewif_jax.analysis.storage import Storage, storage
 from ewif_jax.batch import run_batch
 from ewif_jax.continuous.kalman_bucy import kalman_bucy
-from ewif_jax.estimator import run, step
+from ewif_jax.estimator import run
 from ewif_jax.estimators.bootstrap import bootstrap
 from ewif_jax.estimators.ensemble import ensemble
 from ewif_jax.estimators.ewif import ewif
@@ -45,6 +45,7 @@ from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
+from ewif_jax.live import arrivals, step, step_batch
 from ewif_jax.losses import (
     likelihood_loss,
     log_likelihood,
@@ -107,6 +108,7 @@ __all__ = [
     "alpha_beta_gains",
     "analysis",
     "arrival_order",
+    "arrivals",
     "asd",
     "b1",
     "batch_wls",
@@ -171,6 +173,7 @@ __all__ = [
     "steady_state",
     "steady_state_gain",
     "step",
+    "step_batch",
     "storage",
     "stream",
     "transforms",

@@ -1,4 +1,4 @@
-"""Running an estimator: one arrival at a time (`step`) or a whole stream (`run`)."""
+"""Running an estimator over a whole stream."""
 
 from functools import partial
 from typing import Any, Literal
@@ -11,13 +11,11 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit, transformed
 from ewif_jax.fast.slopes import with_few_slopes
-from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
 from ewif_jax.types import (
     Estimator,
     Gaussian,
-    Info,
     Measurement,
     Numbers,
     Params,
@@ -27,30 +25,6 @@ from ewif_jax.types import (
 )
 
 Clock = Literal["validity", "arrival"]
-
-
-def step(
-    estimator: Estimator, params: Params, state: State, measurement: Measurement
-) -> tuple[Any, Info]:
-    """The state after one arrival, and its diagnostics: the body of `run` as a streaming call.
-
-    The state moves to the measurement's time unless that is past (then the measurement is late).
-    A measurement whose mask is all False changes nothing. One that is not a number (its time, or
-    a present component or its square, is NaN or infinite) changes nothing either: `REJECTED`.
-
-    Args:
-        estimator: any `Estimator`.
-        params: what its parameters are read from.
-        state: from `estimator.init` or an earlier `step`.
-        measurement: one arrival: time (), value (m,), sensor (), mask (m,).
-
-    Raises:
-        ValueError: a known time between two steps of a discrete model.
-    """
-    check_times(estimator.model, measurement, state.time, state.time.dtype)
-    screened, refused = screen(measurement, state.time.dtype)
-    arrival = arrive(estimator, params, state, screened)
-    return arrival.kept, marked(arrival.info, refused)
 
 
 def run(

@@ -91,8 +91,8 @@ def flagged(
     a leading axis of runs."""
     flags = (
         per_run_flags("params", params_per_run, params),
-        _ranked(measurements, (1, 2, 1, 2)),
-        None if prior is None else _ranked(prior, (1, 2)),
+        ranked(measurements, (1, 2, 1, 2)),
+        None if prior is None else ranked(prior, (1, 2)),
         None if times is None else jnp.ndim(times) == 2,
     )
     return (params, measurements, prior, times), flags
@@ -243,6 +243,6 @@ def _least_definite(cov: np.ndarray, scale: np.ndarray) -> int:
     return int(np.argmin(left.min(1)))
 
 
-def _ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
+def ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
     """Which fields of a named tuple have more axes than one run needs."""
     return type(fields)(*(jnp.ndim(x) > rank for x, rank in zip(fields, ranks, strict=True)))

@@ -25,12 +25,17 @@ def apart(fn: Callable[..., Any], *args: Any, double: bool = True) -> Any:
     """`fn(*args)`, its arrays as NumPy's, from a process whose programs are compiled to run fast,
     in double precision or in single. `fn` must be a function of a module."""
     added = os.environ.get(FLAGS_OF_THE_TESTS, "")
-    flags = os.environ.get("XLA_FLAGS", "").removesuffix(added) + (SOON_FAST if added else "")
+    flags = os.environ.get("XLA_FLAGS", "").removesuffix(added) + soon_fast(added)
     with (
         patch.dict(os.environ, XLA_FLAGS=flags),
         ProcessPoolExecutor(1, get_context("spawn"), _strict, (double,)) as pool,
     ):
         return pool.submit(_computed, fn, args).result()
+
+
+def soon_fast(added: str) -> str:
+    """The flags of `SOON_FAST` that are among those the tests `added`, if with other values."""
+    return "".join(f" {x}" for x in SOON_FAST.split() if x.partition("=")[0] in added)
 
 
 def _strict(double: bool) -> None:

@@ -8,7 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from apart import FLAGS_OF_THE_TESTS, SOON_FAST
+from apart import FLAGS_OF_THE_TESTS, soon_fast
 
 import ewif_jax as ej
 from ewif_jax.fast import compiling
@@ -74,7 +74,7 @@ np.savez(sys.argv[1], **found)
 
 
 def numbers(file, how):
-    flags = SOON_FAST if FLAGS_OF_THE_TESTS in os.environ else ""
+    flags = soon_fast(os.environ.get(FLAGS_OF_THE_TESTS, ""))
     environment = {**os.environ, "XLA_FLAGS": flags}
     command = [sys.executable, "-c", CHILD, str(file), how]
     subprocess.run(command, env=environment, check=True)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.kernels.growth import exponential, reciprocal_square
+from ewif_jax.kernels.growth import decayed, exponential, grown, reciprocal_square
 from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
@@ -89,7 +89,13 @@ def ewif(
     growing = growth(tau, weight)
 
     def move(params: Params, state: InformationState, time: Array) -> InformationState:
-        return form.transport(model, params, state, time, growing(params, state.time, time))
+        def fade(variances: Array) -> Array:
+            if tau is None:
+                return grown(variances, growing(params, state.time, time))
+            decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), time.dtype)
+            return decayed(variances, time - state.time, decay)
+
+        return form.transport(model, params, state, time, fade)
 
     def measure(
         params: Params, state: InformationState, measurement: Measurement

@@ -48,7 +48,7 @@ def information(model: Model) -> Estimator:
     def move(params: Params, state: InformationState, time: Array) -> InformationState:
         Q = jnp.asarray(model.process_cov(params, state.time, time), state.mean.dtype)
         checks.shape("Q", Q, (state.mean.shape[0],) * 2)
-        return form.transport(model, params, state, time, 1.0, cholesky.factor(Q).lower)
+        return form.transport(model, params, state, time, None, cholesky.factor(Q).lower)
 
     def measure(
         params: Params, state: InformationState, measurement: Measurement

@@ -85,7 +85,7 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         inside = jnp.abs(time - state.start.time) <= half
         counted = jnp.where(inside, state.start.variances, jnp.inf)
         base = state.start._replace(variances=counted)
-        base = form.transport(model, params, base, jnp.where(inside, time, base.time), 1.0)
+        base = form.transport(model, params, base, jnp.where(inside, time, base.time))
         base = base._replace(time=time)
         stamps = state.buffer.time
         near = jnp.abs(time - stamps) <= half

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax.kernels import cholesky, gaussian
-from ewif_jax.kernels.triangular import triangularise
+from ewif_jax.kernels.triangular import is_some, root_of, small_held, triangularise
 from ewif_jax.models.linearise import need_linear, predict_state
 from ewif_jax.models.model import Model
 from ewif_jax.recipe import from_recipe
@@ -49,7 +49,7 @@ def square_root(model: Model) -> Estimator:
 
     def move(params: Params, state: RootState, time: Array) -> RootState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
-        root = triangularise(jnp.concatenate([F @ state.root, cholesky.factor(Q).lower], 1))
+        root = small_held(triangularise(jnp.concatenate([F @ state.root, root_of(Q)], 1)))
         # Made triangular again it would be the same but for its rounding.
         return RootState(time, mean, jnp.where(time > state.time, root, state.root))
 
@@ -59,7 +59,7 @@ def square_root(model: Model) -> Estimator:
         difference, H, R, mask = compared(model, params, state.mean, measurement)
         m, n = H.shape
         seen = jnp.where(mask[:, None], H @ state.root, 0)
-        noise = cholesky.factor(gaussian.mask_cov(R, mask)).lower
+        noise = root_of(gaussian.mask_cov(R, mask))
         blank = jnp.zeros((n, m), R.dtype)
         # A component that is known exactly already differs from it by rounding, which is no root.
         spreads = jnp.sum(jnp.square(state.root), 1)
@@ -72,7 +72,7 @@ def square_root(model: Model) -> Estimator:
         )
         lower, crossed, root = array[:m, :m], array[m:, :m], array[m:, m:]
         diagonal = jnp.diag(lower)
-        positive = diagonal > 0
+        positive = is_some(diagonal)
         reciprocal = jnp.where(positive, 1 / jnp.where(positive, diagonal, 1), 0)
         factor = cholesky.Factor(lower, reciprocal, jnp.all(positive))
         root = _exactly(root, spreads, cholesky.backward(factor, crossed.T).T @ noise, rounding)

@@ -92,14 +92,18 @@ def _cores() -> int:
 
 
 def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str, Any]) -> Any:
-    """`jax.jit`, with these options on a CPU, where this XLA knows them and nothing is transformed
-    (a program inside another cannot have its own)."""
+    """`jax.jit`, with those of these options that this XLA knows, on a CPU, where nothing is
+    transformed (a program inside another cannot have its own)."""
     plain = jax.jit(fn, static_argnames=static_argnames)
-    quick = jax.jit(fn, static_argnames=static_argnames, compiler_options=dict(options))
+
+    @cache  # the backend, and so what it knows, is there from the first call on
+    def quick() -> Any:
+        known = {name: options[name] for name in options if name in _known()}
+        return jax.jit(fn, static_argnames=static_argnames, compiler_options=known)
 
     @wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (plain if transformed() or not _known() else quick)(*args, **kwargs)
+        return (plain if transformed() or not _known() else quick())(*args, **kwargs)
 
     return call
 
@@ -134,11 +138,14 @@ with jax.ensure_compile_time_eval():
 
 
 @cache
-def _known() -> bool:
-    if jax.default_backend() != "cpu":
-        return False
-    try:
-        jax.jit(lambda: 0, compiler_options={**QUICKEST, **WIDE})()
-    except JaxRuntimeError:
-        return False
-    return True
+def _known() -> frozenset[str]:
+    """The names of the options that this XLA knows: later ones have dropped some."""
+    options = {**QUICKEST, **WIDE} if jax.default_backend() == "cpu" else {}
+    while options:
+        try:
+            jax.jit(lambda: 0, compiler_options=options)()
+            break
+        except JaxRuntimeError as error:  # which names the first that it does not know
+            left = {name: value for name, value in options.items() if name not in str(error)}
+            options = left if len(left) < len(options) else {}
+    return frozenset(options)

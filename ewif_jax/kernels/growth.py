@@ -6,6 +6,9 @@ from jax import Array, lax
 
 from ewif_jax.types import DTypeLike
 
+SHORT = 0.5
+"""In units of tau: what an interval adds to a variance is less than the variance."""
+
 
 def largest_variance(dtype: DTypeLike) -> float:
     """How large a variance may become. The derivative of an update divides by squares of variances:
@@ -25,6 +28,20 @@ def grown(variances: Array, growth: Array | float) -> Array:
     larger = jnp.where(fits, variances, 0) * jnp.where(fits, growth, 1)
     larger = jnp.where(fits, larger, jnp.maximum(lax.stop_gradient(variances), ceiling))
     return jnp.where(jnp.isfinite(growth) & ~jnp.isinf(variances), larger, growth + variances)
+
+
+def decayed(variances: Array, age: Array, tau: Array) -> Array:
+    """`grown` by `exponential(age, tau)`.
+
+    Over many short intervals the factor is nearly 1 and the same, and so is what it was rounded by:
+    a thousand steps of tau / 1000 would be as a tau off by 3e-5 of itself in float32. What is added
+    is rounded anew every time.
+    """
+    ratio = age / tau
+    is_short = (jnp.abs(ratio) < SHORT) & (variances < largest_variance(variances.dtype) / 2)
+    kept = jnp.where(is_short, variances, 0)
+    added = jnp.expm1(jnp.where(jnp.abs(ratio) < SHORT, ratio, 0)).astype(variances.dtype)
+    return jnp.where(is_short, kept + kept * added, grown(variances, exponential(age, tau)))
 
 
 def exponential(age: Array, tau: Array) -> Array:

@@ -1,7 +1,57 @@
 """Triangular factors by modified Gram-Schmidt: square roots of sums of covariances."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
+
+from ewif_jax.kernels import cholesky
+from ewif_jax.types import DTypeLike
+
+
+def least_root(dtype: DTypeLike) -> float:
+    """The root of a variance of zero, as it is held here: its square is still an ordinary number,
+    and so is a derivative over that."""
+    return 2.0 ** (-45 if jnp.finfo(dtype).bits == 32 else -400)
+
+
+def is_some(root: Array) -> Array:
+    """Whether a root is that of a variance that is not zero."""
+    return root > 1024 * least_root(root.dtype)
+
+
+def root_of(a: Array) -> Array:
+    """Lower-triangular L (n, n) with L L' = a, which has a derivative where a is singular too.
+
+    The root of q has none at q = 0, and with a root of 0 every slope would be lost:
+    d(L L') = L dL' + dL L'. So a pivot that is zero to rounding is held as the square of
+    `least_root`, and what a changes by, over that, is how L changes: L dL' is then what it should
+    be.
+    """
+    n, least = a.shape[0], least_root(a.dtype)
+    zero = cholesky.negligible(n, a.dtype) * jnp.diagonal(a)
+    columns, rest = [], a
+    for j in range(n):
+        here = rest[:, j] * jnp.asarray(np.arange(n) >= j, a.dtype)
+        kept = here[j] > zero[j]
+        reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, here[j], 1)), 0)
+        place = jnp.asarray(np.arange(n) == j, a.dtype)
+        changes = (here - lax.stop_gradient(here)) * (1 - place / 2) / least
+        column = jnp.where(kept, here * reciprocal, place * least + changes)
+        columns.append(column)
+        rest = rest - jnp.where(kept, column[:, None] * column[None], 0)
+    return jnp.stack(columns, 1)
+
+
+def small_held(root: Array) -> Array:
+    """The root, where columns of what counts as zero are as small as ever: motion would make
+    something of them. What they change by is kept in the product with its transpose."""
+    least, fixed = least_root(root.dtype), lax.stop_gradient(root)
+    size = jnp.max(jnp.abs(fixed), axis=0)
+    scale = jnp.where((size > least) & ~is_some(size), least / jnp.maximum(size, least), 1)[None]
+    return fixed * scale + (root - fixed) / scale
 
 
 def triangularise(a: Array, least: Array | None = None) -> Array:
@@ -14,14 +64,31 @@ def triangularise(a: Array, least: Array | None = None) -> Array:
     """
     n = a.shape[0]
     rows = [a[i] for i in range(n)]
-    lower = [[jnp.zeros((), a.dtype)] * n for _ in range(n)]
+    zero = jnp.zeros((), a.dtype)
+    lower = [[zero] * n for _ in range(n)]
     for i in range(n):
-        square = rows[i] @ rows[i]
-        kept = square > (0 if least is None else jnp.square(least[i]))
-        reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, square, 1)), 0)
-        unit = rows[i] * reciprocal
-        lower[i][i] = square * reciprocal
+        unit, lower[i][i] = _normalised(rows[i], zero if least is None else least[i])
         for j in range(i + 1, n):
             lower[j][i] = rows[j] @ unit
             rows[j] = rows[j] - lower[j][i] * unit
     return jnp.stack([jnp.stack(row) for row in lower])
+
+
+@jax.custom_jvp
+def _normalised(row: Array, least: Array) -> tuple[Array, Array]:
+    """A row over its length, and the length; zeros of what is no longer than `least` ()."""
+    square = row @ row
+    kept = square > jnp.square(least)
+    reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, square, 1)), 0)
+    return row * reciprocal, square * reciprocal
+
+
+@_normalised.defjvp
+def _normalised_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
+    """Written out, because the derivative of a reciprocal root overflows where `least_root` cubed
+    underflows."""
+    (unit, length), (change, _) = _normalised(*primals), tangents
+    longer = unit @ change
+    kept = length > 0
+    across = (change - longer * unit) / jnp.where(kept, length, 1)
+    return (unit, length), (jnp.where(kept, across, 0), longer)

@@ -12,6 +12,7 @@ from ewif_jax.lab.comparison import Comparison
 from ewif_jax.lab.design import Limits
 from ewif_jax.lab.frames import Frame, from_frame
 from ewif_jax.lab.methods import Method, Tuning, axis
+from ewif_jax.lab.parametric import parametric
 from ewif_jax.lab.states import load_state, save_state
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "compare",
     "from_frame",
     "load_state",
+    "parametric",
     "plots",
     "save_state",
     "to_frame",

@@ -13,6 +13,7 @@ from ewif_jax.arrival import initial
 from ewif_jax.fast.dependence import dependence, traced
 from ewif_jax.lab import methods as lines
 from ewif_jax.lab.methods import Method
+from ewif_jax.lab.parametric import Simulate
 from ewif_jax.monte_carlo import RUN_STEPS, Scenario, Simulation, one_run, takes_params
 from ewif_jax.scores import Score, squared_error, squared_innovation
 from ewif_jax.streams import float_dtype
@@ -225,6 +226,7 @@ def _check_axes(
     params = _first_params(scenario, axes)
     if params is not None:
         program = traced(one_run(scenario), key, params)
+        _check_told(scenario, params)
         for name in set(axes) - used:
             flags = (False, {other: other == name for other in params})
             if any(jax.tree.leaves(dependence(program, flags))):
@@ -237,6 +239,19 @@ def _check_axes(
             f"a Method asks for by lab.axis({name!r})",
             "one that nobody uses",
         )
+
+
+def _check_told(scenario: Scenario, params: Mapping[str, float]) -> None:
+    """Prior and t0 are the scenario's, whatever the numbers."""
+    simulate = scenario.simulate
+    if not isinstance(simulate, Simulate):
+        return
+    program = traced(simulate.told, params)
+    for name in params:
+        flags = ({other: other == name for other in params},)
+        depends = any(jax.tree.leaves(dependence(program, flags)))
+        expected = "an axis on which neither the prior nor t0 of the scenario depends"
+        checks.require(not depends, f"over[{name!r}]", expected, "one that changes them")
 
 
 def _state_size(

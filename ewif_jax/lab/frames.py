@@ -32,6 +32,8 @@ class Frame(Measurement):
     dropped: dict[str, int]
 
     def __repr__(self) -> str:
+        if "dropped" not in vars(self):  # rows of one, which know no table
+            return super().__repr__()
         steps, size = np.shape(self.value)
         when = "" if self.first is None else f", second 0 is {self.first} UTC"
         unit = "" if self.units is None else f" in {self.units}"

@@ -203,7 +203,8 @@ def html(comparison: "Comparison") -> str:
 def _head(comparison: "Comparison") -> str:
     runs, metrics = comparison.runs, ", ".join(comparison.design.metrics)
     count = f"{runs[0]}" if len(set(runs)) == 1 else f"{min(runs)} to {max(runs)}"
+    methods, points = len(comparison.methods), len(comparison.points)
     return (
-        f"{len(comparison.methods)} methods, {len(comparison.points)} points, {count} runs each: "
-        f"{metrics} ± standard error"
+        f"{methods} method{'s' * (methods > 1)}, {points} point{'s' * (points > 1)}, {count} runs"
+        f"{' each' * (points > 1)}: {metrics} ± standard error"
     )

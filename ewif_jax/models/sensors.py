@@ -1,7 +1,7 @@
 """What sensors see. Every kinematic state begins with the position, so a sensor fits any."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -107,7 +107,7 @@ def bank(
     checks.require(len(sizes) == 1, "sensors", "equal numbers of components", sorted(sizes))
     angles = np.asarray([s.angle for s in group])
 
-    def choose(values: list[Array], index: Array) -> Array:
+    def choose(values: list[Array], index: Array) -> Any:
         if len(values) == 1:
             return values[0]
         is_concrete = not isinstance(index, Array) and not any(isinstance(x, Array) for x in values)

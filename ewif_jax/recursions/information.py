@@ -8,6 +8,7 @@ ever unknown again. The targets keep what re-centring leaves over, rounding of t
 far from the origin that is more than what one measurement changes.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.kernels import cholesky, equations, gaussian, symmetric
+from ewif_jax.kernels import cholesky, equations, gaussian, remainders, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.orthogonal import spread
 from ewif_jax.kernels.trees import choose
@@ -64,37 +65,36 @@ def transport(
     params: Params,
     state: InformationState,
     time: Array,
-    growth: Array | float,
+    fade: Callable[[Array], Array] | None = None,
     noise: Array | None = None,
 ) -> InformationState:
-    """The state at `time`, in either direction: variances times `growth`, plus those of `noise`
-    (n, n), a matrix L of which L L' is the process noise (at `time`)."""
+    """The state at `time`, in either direction: variances as `fade` makes them (None: as they are),
+    plus those of `noise` (n, n), a matrix L of which L L' is the process noise (at `time`)."""
     dtype = state.mean.dtype
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
     where = patterns(model)[0]
-    mean = matvec(F, state.mean, where)
-    mean = mean if c is None else mean + c
-    faded = state._replace(time=time, variances=grown(state.variances, growth))
+    mean, rest = remainders.moved(F, c, state.mean, where)
+    variances = state.variances if fade is None else fade(state.variances)
+    faded = state._replace(time=time, mean=mean, variances=variances)
+    back, _ = affine_flow(model, params, time, state.time, dtype)
     if noise is None and where is not None and equations.is_upper(where):
-        back, _ = affine_flow(model, params, time, state.time, dtype)
         rows, diagonal = equations.carried(faded.rows, back, where)
-        return faded._replace(
-            mean=mean,
+        there = faded._replace(
             variances=_over(faded.variances, diagonal),
             rows=rows,
             targets=faded.targets / diagonal,
         )
-    back, _ = affine_flow(model, params, time, state.time, dtype)
-    F, back = (still_at_once(model, x, time == state.time) for x in (F, back))
-    arrived = moved(faded, F, back, noise)._replace(mean=mean)
-    if model.steps is None:
-        return arrived
-    # Of a part of the state, what is known cannot pass a singular F: no estimate after it is the
-    # least-squares one. (Where F^-k only overflows it is infinite, and the part is forgotten.)
-    partly = ~determined(state) & jnp.any(~jnp.isinf(state.variances))
-    lost = partly & jnp.all(jnp.isnan(back))
-    return arrived._replace(variances=jnp.where(lost, jnp.nan, arrived.variances))
+    else:
+        F, back = (still_at_once(model, x, time == state.time) for x in (F, back))
+        there = moved(faded, F, back, noise)
+        if model.steps is not None:
+            # Of a part of the state, what is known cannot pass a singular F: no estimate after it
+            # is the least-squares one. (Where F^-k only overflows, the part is forgotten.)
+            partly = ~determined(state) & jnp.any(~jnp.isinf(state.variances))
+            lost = partly & jnp.all(jnp.isnan(back))
+            there = there._replace(variances=jnp.where(lost, jnp.nan, there.variances))
+    return there._replace(targets=there.targets + equations.times(there.rows, rest))
 
 
 def moved(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
-from ewif_jax.kernels.growth import exponential
+from ewif_jax.kernels.growth import decayed, exponential
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.entry import (
     check_covariances_of,
@@ -115,9 +115,8 @@ def _two_sided(
         )
 
     def moved(state: InformationState, time: Array) -> InformationState:
-        return form.transport(
-            model, params, state, time, exponential(jnp.abs(time - state.time), tau)
-        )
+        age = jnp.abs(time - state.time)
+        return form.transport(model, params, state, time, lambda v: decayed(v, age, tau))
 
     def gathered(reverse: bool) -> tuple[InformationState, Array]:
         """What the first (reversed: the last) 0, 1, ..., T measurements say, T + 1 states, and

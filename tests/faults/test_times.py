@@ -102,7 +102,7 @@ REFUSED = {
     "a zone for t0": ({"t0": datetime(2024, 1, 1, tzinfo=UTC)}, STAMPS[:2], "t0: expected date"),
     "not a time": (
         {},
-        np.array([START, np.datetime64("NaT")]),
+        np.array([START, np.datetime64("NaT", "s")]),
         "measurements.time: expected a time",
     ),
     "words": ({}, np.array(["2024-01-01", "2024-01-02"]), "measurements.time: expected real"),

@@ -174,6 +174,28 @@ def test_a_method_is_tuned_on_runs_of_its_own():
     )
 
 
+def test_a_builder_of_scenarios_is_a_world_with_parameters():
+    build = ej.scenarios.random_walk
+    world = lab.parametric(build, steps=6, r=2.0)
+    assert hash(world.simulate) == hash(lab.parametric(build, steps=6, r=2.0).simulate)
+    assert world == lab.parametric(build, steps=6, r=2.0)
+    assert world != lab.parametric(build, steps=6, r=3.0)
+    own = world.simulate(KEY, {"mean_delay": 2.0, "of the methods": 1.0})
+    other = build(steps=6, r=2.0, mean_delay=2.0).simulate(KEY)
+    np.testing.assert_allclose(own.measurements.time, other.measurements.time, rtol=1e-12)
+    np.testing.assert_allclose(own.truth, other.truth, rtol=1e-12)
+    with pytest.raises(ValueError, match="fixed: expected arguments among q, r"):
+        lab.parametric(build, lag=3)
+
+    def moved(start=0.0):
+        prior = PRIOR._replace(mean=jnp.reshape(start, (1,)))
+        return ej.Scenario(lambda key: simulate(key, {"q": 0.5, "delay": start}), prior, 0.0)
+
+    some = {"EWIF": methods()["EWIF"]}
+    with pytest.raises(ValueError, match=r"over\['start'\].*neither the prior nor t0"):
+        lab.compare(some, lab.parametric(moved), over={"start": [1.0]}, key=KEY)
+
+
 REFUSED = {
     "an axis that nobody uses": ({"over": {"speed": [1.0]}}, r"over\['speed'\].*nobody uses"),
     "an axis that is no number": ({"over": {"delay": ["a"]}}, r"over\['delay'\]: expected a list"),

@@ -48,6 +48,7 @@ def test_a_table_becomes_a_stream_in_order_of_arrival(frame):
     assert repr(found) == (
         "4 measurements of 2 numbers in ft by 2 sensors; rows left out: 1 with nothing measured"
     )
+    assert repr(jax.tree.map(lambda x: x[:1], found)).startswith("Measurement: 1 arrival")
     tracks = lab.from_frame(frame, time="t", value="x", track="id")
     assert list(tracks) == ["a", "b"]
     np.testing.assert_array_equal(tracks["a"].value[:, 0], [10.0, 40.0])

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -40,6 +41,23 @@ def test_two_processes_and_what_a_dead_one_leaves(whole):
         with pytest.warns(RuntimeWarning, match="a worker died"):
             found = lab.compare(LINES, WORLD, executor=executor, **SETTING)
         assert found.dataset.equals(whole)
+
+
+@pytest.mark.slow
+def test_dask_computes_what_a_dead_worker_had_again():
+    dask = pytest.importorskip("distributed")
+    setting = {**SETTING, "runs": 24, "chunk": 2}
+    whole = lab.compare(LINES, WORLD, **setting).dataset
+    cluster = dask.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with cluster, dask.Client(cluster) as client:
+
+        def kill_one(done, total):
+            if done == 3:
+                os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+
+        executor = client.get_executor()
+        found = lab.compare(LINES, WORLD, executor=executor, progress=kill_one, **setting)
+    assert found.dataset.equals(whole)
 
 
 @pytest.mark.slow

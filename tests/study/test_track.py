@@ -76,6 +76,7 @@ def test_tuning_finds_a_better_filter(two_tracks, tmp_path, capsys):
     median = table["median error [m]"]
     assert median["validity", "tuned"] <= median["validity", "before"] * 1.001
     assert median["validity", "tuned"] < 3.0
+    assert (table["scored"].groupby("times").nunique() == 1).all()
     estimates = pd.read_csv(out / "track" / "estimates.csv")
     assert (estimates["status"] == "late_used").sum() == 1
     assert estimates["time"].min() > 1.6e9

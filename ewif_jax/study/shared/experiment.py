@@ -21,11 +21,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from ewif_jax.lab import Comparison, Method, compare
 from ewif_jax.lab.pieces import Arrays
 from ewif_jax.lab.timing import timed
+from ewif_jax.monte_carlo import Scenario
 from ewif_jax.study.shared.folder import Folder
 from ewif_jax.study.shared.refusal import Refused, stop_if_asked
-from ewif_jax.types import Numbers
+from ewif_jax.types import Estimator, Numbers
 
 __all__ = ("Experiment", "Measured", "Options", "Refused", "shown")
 
@@ -133,6 +135,21 @@ class Experiment:
                 bar.update(task, completed=done, total=total)
 
             yield update
+
+    def compare(
+        self,
+        name: str,
+        methods: Mapping[str, Estimator | Method],
+        scenario: Scenario,
+        **setting: Any,
+    ) -> Comparison:
+        """`lab.compare`, shown and timed; a later run goes on behind the last chunk of runs that an
+        interrupted one has finished."""
+        folder, chunk = self.folder.work(name), self.options.chunk
+        with self.timed(name), self.progress(name) as report:
+            return compare(
+                methods, scenario, folder=folder, chunk=chunk, progress=report, **setting
+            )
 
     def piece(self, name: str, compute: Callable[[], Mapping[str, Any]]) -> Arrays:
         """The arrays of `compute()`, read back if an interrupted run has already computed them

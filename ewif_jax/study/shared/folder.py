@@ -5,6 +5,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -107,6 +108,12 @@ class Folder:
         write_piece(path, computed)
         return read_piece(path)
 
+    def work(self, name: str) -> Path:
+        """A folder for work of several parts, each of which is kept as soon as it is done (see
+        `lab.compare`); it goes when the results are there."""
+        self._check()
+        return self.partial / f"work-{name}"
+
     def finish(self, about: Mapping[str, Any], overwrite: bool) -> Path | None:
         """Puts the results in their place; returns where an earlier result is kept, if any is.
 
@@ -129,6 +136,8 @@ class Folder:
         # only now: a crash before this line leaves them to resume from
         for path in [*self.final.glob("piece-*.npz"), *filter(is_half, self.final.iterdir())]:
             path.unlink()
+        for path in self.final.glob("work-*"):
+            shutil.rmtree(path)
         self.leave()
         if earlier is not None and overwrite:
             self.kept = manifest.clear(earlier, self.final)

@@ -14,7 +14,7 @@ from ewif_jax.lab.plane import to_degrees
 from ewif_jax.study.shared.experiment import Experiment, Options
 from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track import figures as track_figures
-from ewif_jax.study.track.loss import filtered, loss, report
+from ewif_jax.study.track.loss import filtered, loss, predicted, report
 from ewif_jax.study.track.method import Method, method
 from ewif_jax.study.track.readings import Readings, read
 from ewif_jax.study.track.tracks import Tracks, batch
@@ -83,7 +83,7 @@ def _followed(
     seed = arguments.seed
     rows = [row for o in outcomes for row in _rows(o, chosen, tracks.row, counted, seed)]
     title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
-    notes = [_statuses(outcomes[0])]
+    notes = [_statuses(outcomes[0]), *_lost(outcomes, counted)]
     if not counted.any():
         notes.append(f"--warm-up: {arguments.warm_up} leaves no measurement to score.")
     experiment.table("track", title, rows, notes)
@@ -145,12 +145,14 @@ def _rows(
     pairs = [("given" if outcome.history is None else "before", outcome.value[0], outcome.before)]
     if outcome.history is not None:
         pairs.append(("tuned", outcome.value[1], outcome.after))
+    # Otherwise a filter that loses the rows that are hard to predict would look better.
+    used = counted & predicted(outcome.before) & predicted(outcome.after)
     return [
         {
             "times": outcome.stamps,
             "setting": setting,
             f"{chosen.name} [{chosen.unit}]": value,
-            **report(found, row, counted, seed),
+            **report(found, row, used, seed),
         }
         for setting, value, found in pairs
     ]
@@ -160,6 +162,19 @@ def _statuses(outcome: Outcome) -> str:
     status = outcome.after["status"]
     counts = [(kind.name.lower().replace("_", " "), (status == kind).sum()) for kind in Status]
     return "Measurements: " + ", ".join(f"{count} {kind}" for kind, count in counts if count)
+
+
+def _lost(outcomes: list[Outcome], counted: np.ndarray) -> list[str]:
+    """What to say of rows that only one of the two settings predicts, which no row counts."""
+    notes = []
+    for outcome in outcomes:
+        before, after = counted & predicted(outcome.before), counted & predicted(outcome.after)
+        if (before != after).any():
+            notes.append(
+                f"Left out of both ({outcome.stamps} times): {(before & ~after).sum()} "
+                f"predicted before tuning only, {(after & ~before).sum()} after tuning only."
+            )
+    return notes
 
 
 def _save(

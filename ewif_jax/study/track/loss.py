@@ -115,12 +115,16 @@ def filtered(
     return {**arrays, "nis": arrays["nis"] / np.maximum(tracks.mask.sum(-1), 1)}
 
 
+def predicted(found: dict[str, np.ndarray]) -> np.ndarray:
+    """Which rows (N,) were predicted and used."""
+    return (found["status"] <= Status.LATE_USED) & np.isfinite(found["error"])
+
+
 def report(
-    found: dict[str, np.ndarray], row: np.ndarray, counted: np.ndarray, seed: int
+    found: dict[str, np.ndarray], row: np.ndarray, used: np.ndarray, seed: int
 ) -> dict[str, Any]:
-    """Median and RMSE of the one-step prediction errors in metres, and NIS per component, with
-    standard errors by resampling tracks."""
-    used = counted & (found["status"] <= Status.LATE_USED) & np.isfinite(found["error"])
+    """Median and RMSE of the one-step prediction errors in metres, and NIS per component, over the
+    rows `used` (N,), with standard errors by resampling tracks."""
     cuts = np.searchsorted(row[used], np.arange(1, row.max() + 1))
     errors, nis_of = (np.split(found[name][used], cuts) for name in ("error", "nis"))
     return {

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ewif_jax.monte_carlo import monte_carlo
+from ewif_jax.moments import standard_error
 from ewif_jax.scenarios.divergence import (
     PUSHES,
     REMEDIES,
@@ -20,7 +20,7 @@ from ewif_jax.scenarios.divergence import (
 from ewif_jax.study.papers.divergence import figures
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.types import Estimator, Numbers, PyTree
+from ewif_jax.types import Numbers, PyTree
 
 EPS, LENGTH = 0.3, 20.0
 GAINS = np.geomspace(0.05, 5.0, 60)
@@ -79,15 +79,16 @@ def run(experiment: Experiment) -> None:
     cases = list(product(PUSHES, REMEDIES))
     filters = {r: divergence_filter(r, dt=dt, setting=chosen(r, dt)) for r in REMEDIES}
 
-    def simulated(push: Push, remedy: Remedy) -> Arrays:
-        return _simulated(experiment, push, remedy, filters[remedy], runs, dt)
-
-    found = {
-        (push, remedy): experiment.piece(
-            f"{push}-{remedy}", lambda case=(push, remedy): simulated(*case)
+    found: dict[tuple[Push, Remedy], Arrays] = {}
+    for number, push in enumerate(PUSHES):
+        world = divergence(push, eps=EPS, dt=dt, length=LENGTH)
+        compared = experiment.compare(
+            f"{push} push", filters, world, runs=runs, key=experiment.key(number), time=True
         )
-        for push, remedy in cases
-    }
+        (steps,) = compared.over_time["squared_error"]
+        errors = zip(steps.mean, standard_error(steps), strict=True)
+        for remedy, (mse, mse_se) in zip(REMEDIES, errors, strict=True):
+            found[push, remedy] = {"mse": mse, "mse_se": mse_se}
     exact = {
         (push, remedy): np.asarray(
             divergence_curve(remedy, push, time, eps=EPS, setting=chosen(remedy, dt))
@@ -128,32 +129,6 @@ def run(experiment: Experiment) -> None:
         ],
     )
     experiment.finish()
-
-
-def _simulated(
-    experiment: Experiment,
-    push: Push,
-    remedy: Remedy,
-    estimator: Estimator,
-    runs: int,
-    dt: float,
-) -> Arrays:
-    """Mean square errors (T,) and their standard errors."""
-    label = f"{push} push, {TEXT[remedy]}"
-    with experiment.timed(label), experiment.progress(label) as report:
-        measured = monte_carlo(
-            estimator,
-            None,
-            divergence(push, eps=EPS, dt=dt, length=LENGTH),
-            runs=runs,
-            key=experiment.key(PUSHES.index(push)),
-            chunk=experiment.options.chunk,
-            progress=report,
-        )
-    return {
-        "mse": measured.per_step["squared_error"],
-        "mse_se": measured.per_step_se["squared_error"],
-    }
 
 
 def _row(
