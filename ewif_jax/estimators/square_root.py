@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import is_some, root_of, small_held, triangularise
@@ -34,7 +34,8 @@ def square_root(model: Model) -> Estimator:
 
     (Potter; Kailath's array form), with orthogonal :math:`\Theta` by modified Gram-Schmidt. P is
     positive semidefinite by construction and float32 keeps twice the digits of P. Q, R and P may
-    be singular or zero.
+    be singular or zero. But measuring exactly (a singular R) what is known exactly already is
+    decided by rounding, of which a root has more than its square: use `kalman` there.
 
     Reduces to: `kalman`.
 
@@ -61,21 +62,12 @@ def square_root(model: Model) -> Estimator:
         seen = jnp.where(mask[:, None], H @ state.root, 0)
         noise = root_of(gaussian.mask_cov(R, mask))
         blank = jnp.zeros((n, m), R.dtype)
-        # A component that is known exactly already differs from it by rounding, which is no root.
-        spreads = jnp.sum(jnp.square(state.root), 1)
-        rounding = cholesky.negligible(n + m, R.dtype)
-        terms = jnp.sum(jnp.square(noise), 1) + jnp.square(jnp.where(mask[:, None], H, 0)) @ spreads
-        least = jnp.where(mask, rounding * jnp.sqrt(terms), 0)
-        array = triangularise(
-            jnp.block([[noise, seen], [blank, state.root]]),
-            jnp.append(least, jnp.zeros(n, R.dtype)),
-        )
+        array = triangularise(jnp.block([[noise, seen], [blank, state.root]]))
         lower, crossed, root = array[:m, :m], array[m:, :m], array[m:, m:]
         diagonal = jnp.diag(lower)
         positive = is_some(diagonal)
         reciprocal = jnp.where(positive, 1 / jnp.where(positive, diagonal, 1), 0)
         factor = cholesky.Factor(lower, reciprocal, jnp.all(positive))
-        root = _exactly(root, spreads, cholesky.backward(factor, crossed.T).T @ noise, rounding)
         innovation = gaussian.Innovation(
             jnp.where(mask, difference, 0), lower @ lower.T, factor, seen
         )
@@ -89,12 +81,3 @@ def square_root(model: Model) -> Estimator:
 
     recursion = Recursion("square_root", start, move, measure, estimate, model=model)
     return estimator_from(recursion._replace(estimated=("mean", "root")))
-
-
-def _exactly(root: Array, spreads: Array, noise: Array, rounding: float) -> Array:
-    """The root (n, n) after a measurement, without rows that an exact one has left only the
-    rounding of: `spreads` (n,) are the variances before, `noise` (n, m) is the root of K R K'."""
-    left = jnp.sum(jnp.square(root), 1) < jnp.square(rounding) * spreads
-    told = jnp.sum(jnp.square(noise), 1) > jnp.square(jnp.finfo(root.dtype).eps) * spreads
-    exact = (left & ~told)[:, None]
-    return root - lax.stop_gradient(jnp.where(exact, root, 0))

@@ -54,20 +54,18 @@ def small_held(root: Array) -> Array:
     return fixed * scale + (root - fixed) / scale
 
 
-def triangularise(a: Array, least: Array | None = None) -> Array:
+def triangularise(a: Array) -> Array:
     """Lower-triangular L (n, n) with L L' = a a' for any a (n, k).
 
-    A row of which, after the ones before it, no more than `least` (n,) is left gives a zero column.
-
     Modified Gram-Schmidt on the rows, which is as accurate here as Householder's reflections
-    (Bjorck 1967) and, unlike their derivative, is defined when rows are zero or dependent.
+    (Bjorck 1967) and, unlike their derivative, is defined when rows are zero or dependent: such a
+    row gives a zero column.
     """
     n = a.shape[0]
     rows = [a[i] for i in range(n)]
-    zero = jnp.zeros((), a.dtype)
-    lower = [[zero] * n for _ in range(n)]
+    lower = [[jnp.zeros((), a.dtype)] * n for _ in range(n)]
     for i in range(n):
-        unit, lower[i][i] = _normalised(rows[i], zero if least is None else least[i])
+        unit, lower[i][i] = _normalised(rows[i])
         for j in range(i + 1, n):
             lower[j][i] = rows[j] @ unit
             rows[j] = rows[j] - lower[j][i] * unit
@@ -75,19 +73,19 @@ def triangularise(a: Array, least: Array | None = None) -> Array:
 
 
 @jax.custom_jvp
-def _normalised(row: Array, least: Array) -> tuple[Array, Array]:
-    """A row over its length, and the length; zeros of what is no longer than `least` ()."""
+def _normalised(row: Array) -> tuple[Array, Array]:
+    """A row over its length, and the length; zeros of zeros."""
     square = row @ row
-    kept = square > jnp.square(least)
+    kept = square > 0
     reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, square, 1)), 0)
     return row * reciprocal, square * reciprocal
 
 
 @_normalised.defjvp
-def _normalised_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
+def _normalised_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
     """Written out, because the derivative of a reciprocal root overflows where `least_root` cubed
     underflows."""
-    (unit, length), (change, _) = _normalised(*primals), tangents
+    (unit, length), (change,) = _normalised(*primals), tangents
     longer = unit @ change
     kept = length > 0
     across = (change - longer * unit) / jnp.where(kept, length, 1)
