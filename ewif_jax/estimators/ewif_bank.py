@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.growth import exponential
 from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
@@ -122,7 +123,7 @@ def ewif_bank(model: Model, taus: Parameter, forgetting: Parameter = 0.98) -> Es
         teaches = jnp.any(is_awake) & jnp.isfinite(total)
         learnt = jnp.where(is_awake, shared + told - jnp.where(teaches, total, 0), shared)
         weights = _normalised(jnp.where(teaches, learnt, state.log_weights))
-        info = _mixed_info(infos, jnp.exp(within), is_awake, total)
+        info = _mixed_info(infos, jnp.exp(within), is_awake, total, measurement.mask)
         return BankState(state.time, members, weights), info
 
     def estimate(params: Params, state: BankState) -> Gaussian:
@@ -204,13 +205,13 @@ def _mixed(weights: Array, is_awake: Array, means: Array, covs: Array) -> tuple[
     return mean, jnp.sum(weights[:, None, None] * spread, 0)
 
 
-def _mixed_info(infos: Info, weights: Array, is_awake: Array, total: Array) -> Info:
+def _mixed_info(infos: Info, weights: Array, is_awake: Array, total: Array, mask: Array) -> Info:
     """The mixture's `Info`: NaN innovation and log likelihood 0 while no member predicts."""
     innovation, cov = _mixed(weights, is_awake, infos.innovation, infos.innovation_cov)
     any_awake = jnp.any(is_awake)
     is_used = any_awake & jnp.any(infos.status == Status.USED)
-    # Where nothing was seen the members agree on what is reported: identity and 0.
-    innovation = jnp.where(any_awake, innovation, infos.innovation[0])
-    cov = jnp.where(any_awake, cov, infos.innovation_cov[0])
+    # Of what is absent, exactly 0 and the identity: weights sum to 1 up to rounding only.
+    innovation = jnp.where(any_awake, jnp.where(mask, innovation, 0), infos.innovation[0])
+    cov = jnp.where(any_awake, gaussian.mask_cov(cov, mask), infos.innovation_cov[0])
     likelihood = jnp.where(is_used, total, 0)
     return Info(innovation, cov, likelihood, infos.delay[0], infos.status[0])
