@@ -86,7 +86,16 @@ from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
 from ewif_jax.streams import arrival_order, newest, stream
 from ewif_jax.transforms import Transform
-from ewif_jax.tuning import StandardErrors, Tuned, standard_errors, tune
+from ewif_jax.tuning import (
+    StandardErrors,
+    Tuned,
+    cross_validated,
+    posterior,
+    run_folds,
+    standard_errors,
+    time_folds,
+    tune,
+)
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 __all__ = [
@@ -119,6 +128,7 @@ __all__ = [
     "bootstrap",
     "continuous",
     "crlb",
+    "cross_validated",
     "cutoff_delay",
     "delayed_gain",
     "drop_late",
@@ -156,6 +166,7 @@ __all__ = [
     "pf_extended",
     "pf_fixed_point",
     "pf_retrodict",
+    "posterior",
     "prediction_loss",
     "prepare_cpu",
     "random_walk_cutoff",
@@ -167,6 +178,7 @@ __all__ = [
     "rts_reference",
     "run",
     "run_batch",
+    "run_folds",
     "run_parallel",
     "savgol",
     "scenarios",
@@ -181,6 +193,7 @@ __all__ = [
     "step_batch",
     "storage",
     "stream",
+    "time_folds",
     "transforms",
     "tune",
     "two_sided_ewif",
