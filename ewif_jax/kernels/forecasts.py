@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.stats import norm
+from jax.scipy.special import ndtr
 
 from ewif_jax.kernels import cholesky
 
@@ -25,7 +25,8 @@ def gaussian_crps(error: Array, spread: Array) -> Array:
     is_wide = spread > 0
     sigma = jnp.where(is_wide, spread, 1)
     z = jnp.where(is_wide, error, 0) / sigma
-    score = sigma * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+    density = jnp.exp(-jnp.square(z) / 2) / np.sqrt(2 * np.pi)
+    score = sigma * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))
     return jnp.where(is_wide, score, jnp.abs(error))
 
 
