@@ -65,7 +65,8 @@ def mean_length(mean: Array, cov: Array) -> Array:
         white = cholesky.forward(factor, mean)
         exponent = cholesky.half_log_det(factor) + t * jnp.sum(jnp.square(white))
         # The logarithm of 1 + t loses the digits of a small t.
-        exponent = jnp.where(t < small, t - jnp.square(t) * second, exponent)
+        few = jnp.minimum(t, small)  # the square of a large t is infinite in float32
+        exponent = jnp.where(t < small, few - jnp.square(few) * second, exponent)
         return -jnp.expm1(-exponent) * jnp.exp(-log / 2)
 
     total = jnp.sum(jnp.asarray(WEIGHTS, mean.dtype) * jax.vmap(missing)(nodes))
