@@ -123,7 +123,8 @@ def _end(
         inside, outside = outside, 2 * outside
         if outside > FARTHEST:
             return sign * np.inf
-    return best[k] + sign * float(brentq(excess, inside, outside, xtol=1e-6))
+    root: Any = brentq(excess, inside, outside, xtol=1e-6)
+    return float(best[k] + sign * root)
 
 
 def _least(
