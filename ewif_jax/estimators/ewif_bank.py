@@ -8,7 +8,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import gaussian
-from ewif_jax.kernels.growth import exponential
+from ewif_jax.kernels.growth import decayed, exponential
 from ewif_jax.models.entry import without_process_noise
 from ewif_jax.models.linearise import need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
@@ -99,8 +99,10 @@ def ewif_bank(model: Model, taus: Parameter, forgetting: Parameter = 0.98) -> Es
 
     def move(params: Params, state: BankState, time: Array) -> BankState:
         def moved(member: InformationState, tau: Array) -> InformationState:
-            growth = exponential(time - state.time, tau)
-            return form.transport(model, params, member, time, growth)
+            def fade(variances: Array) -> Array:
+                return decayed(variances, time - state.time, tau)
+
+            return form.transport(model, params, member, time, fade)
 
         members = jax.vmap(moved)(state.members, decays(params, time.dtype))
         return BankState(time, members, state.log_weights)
