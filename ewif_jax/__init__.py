@@ -37,6 +37,7 @@ from ewif_jax.estimator import run
 from ewif_jax.estimators.bootstrap import bootstrap
 from ewif_jax.estimators.ensemble import ensemble
 from ewif_jax.estimators.ewif import ewif
+from ewif_jax.estimators.ewif_bank import bank_weights, ewif_bank
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
 from ewif_jax.estimators.information import information
@@ -85,7 +86,17 @@ from ewif_jax.smoothers.savgol import savgol
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
 from ewif_jax.streams import arrival_order, newest, stream
 from ewif_jax.transforms import Transform
-from ewif_jax.tuning import Tuned, tune
+from ewif_jax.tuning import (
+    StandardErrors,
+    Tuned,
+    cross_validated,
+    posterior,
+    profile_intervals,
+    run_folds,
+    standard_errors,
+    time_folds,
+    tune,
+)
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Status, Trace
 
 __all__ = [
@@ -96,6 +107,7 @@ __all__ = [
     "Model",
     "Scenario",
     "Simulation",
+    "StandardErrors",
     "Statistics",
     "Status",
     "Storage",
@@ -111,11 +123,13 @@ __all__ = [
     "arrivals",
     "asd",
     "b1",
+    "bank_weights",
     "batch_wls",
     "bl1",
     "bootstrap",
     "continuous",
     "crlb",
+    "cross_validated",
     "cutoff_delay",
     "delayed_gain",
     "drop_late",
@@ -125,6 +139,7 @@ __all__ = [
     "equivalent_process_noise",
     "equivalent_tau",
     "ewif",
+    "ewif_bank",
     "expected_mse",
     "extended",
     "fading",
@@ -152,8 +167,10 @@ __all__ = [
     "pf_extended",
     "pf_fixed_point",
     "pf_retrodict",
+    "posterior",
     "prediction_loss",
     "prepare_cpu",
+    "profile_intervals",
     "random_walk_cutoff",
     "random_walk_gain",
     "replay",
@@ -163,6 +180,7 @@ __all__ = [
     "rts_reference",
     "run",
     "run_batch",
+    "run_folds",
     "run_parallel",
     "savgol",
     "scenarios",
@@ -170,12 +188,14 @@ __all__ = [
     "selective",
     "simulate_batch",
     "square_root",
+    "standard_errors",
     "steady_state",
     "steady_state_gain",
     "step",
     "step_batch",
     "storage",
     "stream",
+    "time_folds",
     "transforms",
     "tune",
     "two_sided_ewif",

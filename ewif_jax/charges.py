@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from ewif_jax.kernels.forecasts import gaussian_crps, gaussian_energy
 from ewif_jax.streams import float_dtype
 from ewif_jax.types import Measurement, Numbers
 
@@ -26,7 +27,13 @@ WIDTH = 10.0
 no filter that predicts at all does worse, and that one row's value hardly matters."""
 
 
-def value_charges(measurements: Measurement, cost: Cost, unknowns: int) -> Any:
+def value_charges(
+    measurements: Measurement,
+    cost: Cost,
+    unknowns: int,
+    ahead: int = 1,
+    components: Any = None,
+) -> Any:
     """What each row (R, T) costs where the filter does not predict it.
 
     Rows count that have a component, after earlier rows have had `unknowns` components together:
@@ -36,6 +43,8 @@ def value_charges(measurements: Measurement, cost: Cost, unknowns: int) -> Any:
         measurements: a batch: value (R, T, m); the other fields may lack the axis of runs.
         cost: of an error of the predictor that knows mean and spread.
         unknowns: how many components determine the state; 0 with a prior.
+        ahead: how many measured rows earlier they have to have been measured.
+        components: which count, (1 or R, T, m); None: all.
     """
     xp = _module(measurements.value, measurements.sensor, measurements.mask)
     # Sums of squares in float64: what float32 cannot square is still compared with its like.
@@ -45,9 +54,11 @@ def value_charges(measurements: Measurement, cost: Cost, unknowns: int) -> Any:
     value = xp.where(present, value, 0)
     sensor = xp.broadcast_to(xp.asarray(measurements.sensor), value.shape[:2])
     error, spread = _about_the_mean(value, present, sensor)
-    components = mask.sum(-1)
-    earlier = xp.cumsum(components, -1) - components
-    counted = (components > 0) & (earlier >= unknowns)
+    counted = _foreseen(mask, unknowns, ahead)
+    if components is not None:
+        present = present & xp.broadcast_to(xp.asarray(components), present.shape)
+        counted &= (mask & xp.broadcast_to(xp.asarray(components), mask.shape)).any(-1)
+        error = xp.where(present, error, 0)
     charge = cost(error, xp.where(present, spread, 1), present)
     largest = float(jnp.finfo(float_dtype(measurements.value)).max) ** 0.5
     too_large = (abs(value) > largest).any(-1)
@@ -55,11 +66,25 @@ def value_charges(measurements: Measurement, cost: Cost, unknowns: int) -> Any:
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
-def truth_charges(truth: Numbers, measurements: Measurement, unknowns: int) -> Any:
+def _foreseen(mask: Any, unknowns: int, ahead: int) -> Any:
+    """Which rows (R, T) are measured, `ahead` measured rows after `unknowns` components have
+    been."""
+    measured = mask.any(-1)
+    components = mask.sum(-1).cumsum(-1)
+    first = (measured & (components < unknowns)).sum(-1, keepdims=True) + (unknowns > 0)
+    earlier = measured.cumsum(-1) - measured
+    # With a prior the first rows are predicted from that.
+    back = (ahead - 1) * (unknowns > 0)
+    return measured & (earlier - back >= first)
+
+
+def truth_charges(
+    truth: Numbers, measurements: Measurement, unknowns: int, components: Any = None
+) -> Any:
     """The squared distance (R, T) or (T,) of the truth (..., k) from its mean over runs and rows.
 
     Rows count whose truth is a number, from the row on with which `unknowns` components have been
-    measured.
+    measured; of `components` (1 or R, T, k) only those.
     """
     mask = measurements.mask
     xp = _module(truth, mask)
@@ -68,9 +93,13 @@ def truth_charges(truth: Numbers, measurements: Measurement, unknowns: int) -> A
     is_given = xp.isfinite(truth).all(-1)
     filled = xp.where(is_given[..., None], truth, 0)
     mean = filled.sum(axes) / xp.maximum(is_given.sum(), 1)
-    charge = xp.square(filled - xp.broadcast_to(mean, filled.shape)).sum(-1)
+    apart = filled - xp.broadcast_to(mean, filled.shape)
+    if components is not None:
+        shape = np.broadcast_shapes(apart.shape, np.shape(components))
+        apart = xp.broadcast_to(apart, shape) * xp.asarray(components)
+    charge = xp.square(apart).sum(-1)
     measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)
-    shape = np.broadcast_shapes(is_given.shape, measured.shape)
+    shape = np.broadcast_shapes(is_given.shape, measured.shape, charge.shape)
     is_given, measured, charge = (xp.broadcast_to(x, shape) for x in (is_given, measured, charge))
     counted = is_given & (measured >= unknowns)
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
@@ -85,6 +114,24 @@ def squared_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
 def length_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """The length of the error about the mean."""
     return squared_cost(error, spread, present) ** 0.5
+
+
+def crps_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
+    """The continuous ranked probability score of independent Gaussians `WIDTH` times as wide as the
+    values spread, summed over components."""
+    xp = _module(error, spread, present)
+    score = gaussian_crps(jnp.asarray(error), jnp.asarray(WIDTH * spread))
+    return xp.where(present, xp.asarray(score), 0).sum(-1)
+
+
+def energy_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
+    """The energy score of the same Gaussians."""
+    xp = _module(error, spread, present)
+    wide = jnp.where(jnp.asarray(present), jnp.asarray(WIDTH * spread), 0)
+    flat = wide.reshape(-1, wide.shape[-1])
+    errors = jnp.where(jnp.asarray(present), jnp.asarray(error), 0).reshape(flat.shape)
+    covs = jax.vmap(jnp.diag)(jnp.square(flat))
+    return xp.asarray(jax.vmap(gaussian_energy)(errors, covs).reshape(wide.shape[:-1]))
 
 
 def density_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:

@@ -9,6 +9,16 @@ measured (n states) do not count, nor do rows of which nothing is present. So mo
 cut-off, a gate or tau until rows go unused does not lower the loss of a stream that was predicted
 well. ``unused="leave out"`` leaves such rows out instead, as they come.
 
+**Which rows you count** say two arguments of every loss: ``where=``, booleans (T,) or (R, T) for
+rows, or with a last axis for components (of the measurements; of the truth in `rmse_loss`), and
+``warm_up=``, how many measured rows at the start of each run do not count. The filter still uses
+all rows; those left out cost nothing and divide nothing. Masked and missing rows never count where
+measurements are predicted; an RMSE counts the estimate there too, so that a long gap can dominate
+it (``where=`` of the measured rows leaves it out).
+
+``ahead=k`` of the losses of predictions: each measurement is predicted from those that arrived k or
+more before it; a sequence of horizons means the mean of their losses.
+
 An infinite score makes a loss infinite. Values out of their domain (a negative variance) make it
 infinite too. With no row to score at all it is 0.
 """
@@ -20,19 +30,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ewif_jax import scores
-from ewif_jax.charges import (
-    WIDTH,
-    density_cost,
-    length_cost,
-    squared_cost,
-    truth_charges,
-)
-from ewif_jax.charging import Charging, Unused, charging_of, value_charging
-from ewif_jax.scores import Score, average
+from ewif_jax import checks, scores
+from ewif_jax.averages import averaged, consistency_of, itself, or_infinite, over_horizons, root_of
+from ewif_jax.charges import density_cost, length_cost, squared_cost
+from ewif_jax.charging import Rows, Unused, truth_charging, value_charging
+from ewif_jax.forecast_losses import crps_loss, energy_loss, nis_shape_loss
 from ewif_jax.types import Estimator, Measurement, Numbers, Params
 
 Loss = Callable[..., Array]
+__all__ = [
+    "Loss",
+    "crps_loss",
+    "energy_loss",
+    "likelihood_loss",
+    "log_likelihood",
+    "nees_loss",
+    "nis_loss",
+    "nis_shape_loss",
+    "prediction_loss",
+    "rmse_loss",
+]
 
 
 def rmse_loss(
@@ -41,6 +58,8 @@ def rmse_loss(
     truth: Numbers,
     *,
     unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
     **setting: Any,
 ) -> Loss:
     r"""params -> RMSE of the first k state components over all runs and arrivals.
@@ -59,6 +78,8 @@ def rmse_loss(
         measurements: a stream (T, ...) or a batch (R, T, ...).
         truth: (T, k) or (R, T, k), NaN where there is none.
         unused: "charge", or "leave out" rows without an estimate.
+        where: which rows, or which components (..., k) of the truth, count.
+        warm_up: how many measured rows at the start of each run do not count.
         **setting: prior, t0, times, clock, key, devices, ... as in `run_batch`.
 
     Returns:
@@ -68,16 +89,20 @@ def rmse_loss(
         ValueError: (when called) what `run_batch` refuses; a truth of the wrong shape; an unknown
             `unused`.
     """
-
-    def charges(batch: Measurement, unknowns: int) -> Any:
-        return truth_charges(truth, batch, unknowns)
-
-    charging = charging_of(estimator, measurements, charges, unused, setting)
-    return _averaged(charging, truth, scores.squared_error, _root)
+    rows = Rows(where, warm_up)
+    charging = truth_charging(estimator, measurements, truth, unused, setting, rows)
+    return averaged(charging, truth, scores.squared_error, root_of)
 
 
 def likelihood_loss(
-    estimator: Estimator, measurements: Measurement, *, unused: Unused = "charge", **setting: Any
+    estimator: Estimator,
+    measurements: Measurement,
+    *,
+    unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
+    ahead: Numbers = 1,
+    **setting: Any,
 ) -> Loss:
     r"""params -> mean negative log likelihood of a measurement given the earlier ones.
 
@@ -86,13 +111,19 @@ def likelihood_loss(
 
     Args:
         estimator, measurements, setting: as in `rmse_loss`.
-        unused: "charge" (see the top of `ewif_jax.losses`) or "leave out".
+        unused, where, warm_up, ahead: see the top of `ewif_jax.losses`. Of some components only,
+            the density is that of the Gaussian of innovation and covariance.
 
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    charging = value_charging(estimator, measurements, density_cost, unused, setting)
-    return _averaged(charging, None, scores.negative_log_likelihood, _itself)
+
+    def build(horizon: int) -> Loss:
+        rows = Rows(where, warm_up, horizon)
+        charging = value_charging(estimator, measurements, density_cost, unused, setting, rows)
+        return averaged(charging, None, scores.negative_log_likelihood, itself)
+
+    return over_horizons(ahead, build)
 
 
 def log_likelihood(
@@ -101,6 +132,8 @@ def log_likelihood(
     measurements: Measurement,
     *,
     unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
     **setting: Any,
 ) -> Array:
     r"""The log likelihood () of all measurements together, :math:`\log p(z_1 \dots z_T)`.
@@ -112,15 +145,17 @@ def log_likelihood(
         params: its parameters.
         measurements: a stream (T, ...) or a batch (R, T, ...), over which it is summed.
         unused: "charge" or "leave out" rows that are not used.
+        where, warm_up: which rows count; see the top of `ewif_jax.losses`.
         **setting: prior, t0, times, clock, key, devices, ... as in `run_batch`.
 
     Returns:
         (); -inf where a value is out of its domain.
     """
-    charging = value_charging(estimator, measurements, density_cost, unused, setting)
+    rows = Rows(where, warm_up)
+    charging = value_charging(estimator, measurements, density_cost, unused, setting, rows)
     values = charging.scored(params, None, scores.negative_log_likelihood)
     total = jnp.sum(jnp.where(jnp.isnan(values), 0, values))
-    return -_or_infinite(total)
+    return -or_infinite(total)
 
 
 def prediction_loss(
@@ -129,6 +164,9 @@ def prediction_loss(
     *,
     robust: bool = False,
     unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
+    ahead: Numbers = 1,
     **setting: Any,
 ) -> Loss:
     r"""params -> root mean square of the one-step prediction errors; needs no truth.
@@ -139,16 +177,21 @@ def prediction_loss(
     Args:
         estimator, measurements, setting: as in `rmse_loss`.
         robust: the mean length of the errors instead, which outliers pull less.
-        unused: "charge" (see the top of `ewif_jax.losses`) or "leave out".
+        unused, where, warm_up, ahead: see the top of `ewif_jax.losses`.
 
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
     cost = length_cost if robust else squared_cost
-    charging = value_charging(estimator, measurements, cost, unused, setting)
-    if robust:
-        return _averaged(charging, None, scores.robust_innovation, _itself)
-    return _averaged(charging, None, scores.squared_innovation, _root)
+
+    def build(horizon: int) -> Loss:
+        rows = Rows(where, warm_up, horizon)
+        charging = value_charging(estimator, measurements, cost, unused, setting, rows)
+        if robust:
+            return averaged(charging, None, scores.robust_innovation, itself)
+        return averaged(charging, None, scores.squared_innovation, root_of)
+
+    return over_horizons(ahead, build)
 
 
 def nees_loss(
@@ -157,6 +200,8 @@ def nees_loss(
     truth: Numbers,
     *,
     unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
     **setting: Any,
 ) -> Loss:
     """params -> squared log of the average NEES over its expectation: 0 if consistent.
@@ -166,87 +211,45 @@ def nees_loss(
     by how many they are. An average of exactly 0 counts as the smallest positive number.
 
     Args:
-        estimator, measurements, truth, unused, setting: as in `rmse_loss`.
+        estimator, measurements, truth, unused, warm_up, setting: as in `rmse_loss`.
+        where: which rows count.
 
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-
-    def charges(batch: Measurement, unknowns: int) -> Any:
-        return truth_charges(truth, batch, unknowns)
-
-    charging = charging_of(estimator, measurements, charges, unused, setting)
-    return _consistency(charging, truth, scores.normalised_error)
+    if where is not None:
+        whole = np.ndim(where) < np.ndim(measurements.value)
+        checks.require(whole, "where", "rows, not components", f"shape {np.shape(where)}")
+    rows = Rows(where, warm_up)
+    charging = truth_charging(estimator, measurements, truth, unused, setting, rows)
+    return consistency_of(charging, truth, scores.normalised_error)
 
 
 def nis_loss(
-    estimator: Estimator, measurements: Measurement, *, unused: Unused = "charge", **setting: Any
+    estimator: Estimator,
+    measurements: Measurement,
+    *,
+    unused: Unused = "charge",
+    where: Numbers = None,
+    warm_up: int = 0,
+    ahead: Numbers = 1,
+    **setting: Any,
 ) -> Loss:
     """params -> squared log of the average NIS over its expectation: 0 if consistent.
 
     A row that is not used or predicted costs log(100)^2, as in `nees_loss`.
 
     Args:
-        estimator, measurements, unused, setting: as in `rmse_loss`.
+        estimator, measurements, setting: as in `rmse_loss`.
+        unused, where, warm_up, ahead: see the top of `ewif_jax.losses`.
 
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    charging = value_charging(estimator, measurements, squared_cost, unused, setting)
-    return _consistency(charging, None, scores.normalised_innovation)
 
+    def build(horizon: int) -> Loss:
+        rows = Rows(where, warm_up, horizon)
+        charging = value_charging(estimator, measurements, squared_cost, unused, setting, rows)
+        return consistency_of(charging, None, scores.normalised_innovation)
 
-def _averaged(
-    charging: Charging, truth: Numbers, score: Score, finish: Callable[[Array], Array]
-) -> Loss:
-    def loss(params: Params) -> Array:
-        return _or_infinite(finish(_mean(charging.scored(params, truth, score))))
-
-    return loss
-
-
-def _consistency(charging: Charging, truth: Numbers, score: Score) -> Loss:
-    def loss(params: Params) -> Array:
-        values = charging.raw(params, truth, score)
-        if charging.unused == "leave out":
-            return _or_infinite(_squared_log(average(values)))
-        charge = jnp.broadcast_to(jnp.asarray(charging.charge(params)), values.shape)
-        counted = ~jnp.isnan(charge)
-        values = jnp.where(counted, values, jnp.nan)
-        rows, answered = jnp.sum(counted), jnp.sum(~jnp.isnan(values))
-        share, silent = (
-            x.astype(values.dtype) / jnp.maximum(rows, 1).astype(values.dtype)
-            for x in (answered, rows - answered)
-        )
-        seen = _squared_log(jnp.where(answered > 0, _mean(values), 1))
-        return _or_infinite(share * seen + silent * _WIDE)
-
-    return loss
-
-
-_WIDE = float(np.log(WIDTH**2) ** 2)
-
-
-def _mean(values: Array) -> Array:
-    """The mean of what is not NaN; 0 of nothing."""
-    is_score = ~jnp.isnan(values)
-    count = jnp.maximum(jnp.sum(is_score), 1).astype(values.dtype)
-    return jnp.sum(jnp.where(is_score, values, 0)) / count
-
-
-def _itself(x: Array) -> Array:
-    return x
-
-
-def _root(x: Array) -> Array:
-    """The root, with derivative 0 at 0: where no error is left there is nothing to tune."""
-    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), x)
-
-
-def _squared_log(ratio: Array) -> Array:
-    tiny = jnp.finfo(ratio.dtype).tiny
-    return jnp.square(jnp.log(jnp.where(ratio < tiny, tiny, ratio)))
-
-
-def _or_infinite(loss: Array) -> Array:
-    return jnp.where(jnp.isnan(loss), jnp.inf, loss)
+    return over_horizons(ahead, build)

@@ -15,11 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.special import gammainc
 
 from ewif_jax import checks
 from ewif_jax.analysis import consistency
 from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.fast.compiling import array
+from ewif_jax.kernels import gaussian
+from ewif_jax.kernels.forecasts import gaussian_crps, gaussian_energy
 from ewif_jax.streams import checked_stream, float_dtype, present_values
 from ewif_jax.types import Estimator, Measurement, Numbers, Params, Status
 
@@ -72,6 +75,90 @@ def robust_innovation(step: Step, truth: Array, mask: Array) -> Array:
     return _where_used(step, length)
 
 
+def crps(step: Step, truth: Array, mask: Array) -> Array:
+    """The continuous ranked probability score of the predicted Gaussian, summed over components;
+    NaN if the measurement was not used."""
+    del truth
+    spread = jnp.diagonal(step.info.innovation_cov)
+    each = gaussian_crps(_defined(step), _root(spread))
+    return _where_used(step, jnp.sum(jnp.where(mask, each, 0)))
+
+
+def energy(step: Step, truth: Array, mask: Array) -> Array:
+    """The energy score of the predicted Gaussian; NaN if the measurement was not used."""
+    del truth
+    both = mask[:, None] & mask[None, :]
+    cov = jnp.where(both, step.info.innovation_cov, 0)
+    cov = jnp.where(jnp.all(jnp.isfinite(cov)), cov, 0)
+    return _where_used(step, gaussian_energy(_defined(step), cov))
+
+
+def surprise(step: Step, truth: Array, mask: Array) -> Array:
+    """The probability that a chi-square number is smaller than the NIS: uniform if consistent; NaN
+    if the measurement was not used."""
+    del truth
+    square = consistency.nis(step.info)
+    is_defined = jnp.isfinite(square)
+    # Near 0 the distribution of one component is infinitely steep.
+    half = jnp.maximum(jnp.where(is_defined, square, 1) / 2, jnp.finfo(square.dtype).tiny)
+    freedom = jnp.maximum(jnp.sum(mask).astype(square.dtype), 1) / 2
+    return _where_used(step, jnp.where(is_defined, gammainc(freedom, half), jnp.nan))
+
+
+def of_components(score: Score, of_values: bool) -> Score:
+    """The score of those components only that count: its `mask`, of measured values (their joint
+    density is the Gaussian of innovation and covariance) or else of the truth."""
+    return _of_values(score) if of_values else _of_truth(score)
+
+
+@cache
+def _of_values(score: Score) -> Score:
+    def of_some(step: Step, truth: Array, mask: Array) -> Array:
+        info = step.info
+        innovation = gaussian.innovate(
+            _defined(step),
+            jnp.zeros((mask.shape[0], 1), step.mean.dtype),
+            info.innovation_cov,
+            mask,
+        )
+        likelihood = jnp.where(
+            jnp.isfinite(info.log_likelihood) & (info.log_likelihood != 0),
+            gaussian.log_density(innovation, mask),
+            info.log_likelihood,
+        )
+        shown = jnp.where(jnp.isfinite(info.innovation), innovation.value, info.innovation)
+        some = info._replace(
+            innovation=shown, innovation_cov=innovation.cov, log_likelihood=likelihood
+        )
+        found = score(step._replace(info=some), truth, mask)
+        return jnp.where(jnp.any(mask), found, jnp.nan)
+
+    return of_some
+
+
+@cache
+def _of_truth(score: Score) -> Score:
+    def of_some(step: Step, truth: Array, counts: Array) -> Array:
+        k = truth.shape[0]
+        # What does not count is estimated exactly, with a variance that is known.
+        shown = jnp.where(counts | jnp.isnan(truth), truth, step.mean[:k])
+        found = score(step, shown, counts)
+        return jnp.where(jnp.any(counts), found, jnp.nan)
+
+    return of_some
+
+
+def _defined(step: Step) -> Array:
+    """The innovation; 0 where it is not a number."""
+    innovation = step.info.innovation
+    return jnp.where(jnp.isfinite(innovation), innovation, 0)
+
+
+def _root(x: Array) -> Array:
+    is_positive = x > 0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1)), 0)
+
+
 def scored(
     estimator: Estimator,
     params: Params,
@@ -79,6 +166,7 @@ def scored(
     truth: Numbers = None,
     *,
     scores: Mapping[str, Score],
+    counted: Numbers = None,
     **setting: Any,
 ) -> dict[str, Array]:
     """Scores (R, T) of every run and arrival, in the fast layout of `run_batch`.
@@ -88,6 +176,8 @@ def scored(
         measurements: a batch (R, T, ...); a single stream (T, ...) is a batch of one.
         truth: (T, k) or (R, T, k), NaN where there is none; None for scores that need none.
         scores: functions (step, truth, mask) -> () by name.
+        counted: (1 or R, T, k) which components count, of the truth, or of the values if there is
+            no truth: the scores' `mask`; default the measurements' mask.
         **setting: prior, t0, times, clock, key, params_per_run, devices, ... as in `run_batch`.
 
     Raises:
@@ -105,6 +195,16 @@ def scored(
     same = truth.shape[-2] == steps and (truth.ndim == 2 or truth.shape[0] == runs)
     checks.require(same, "truth", f"{runs} runs and {steps} arrivals", f"shape {truth.shape}")
     mask = array(measurements.mask)
+    if counted is not None:
+        counted = array(counted)
+        counted = counted[0] if counted.shape[0] == 1 else counted
+        if truth.shape[-1]:
+            mask = counted
+        else:
+            ranks = max(mask.ndim, counted.ndim)
+            wide = [x[None] if x.ndim < ranks else x for x in (mask, counted)]
+            mask = wide[0] & wide[1]
+            mask = mask[0] if mask.shape[0] == 1 and mask.ndim == 3 and runs > 1 else mask
     return run_batch(
         estimator,
         params,

@@ -134,6 +134,23 @@ def found_domain(
     return Domain(transforms, tuple(leaves), notes)
 
 
+def kept_signs(
+    given: Sequence[Transform | None], start: Sequence[Any], refuses: Refuses
+) -> list[Transform]:
+    """The transforms given, and of other leaves: one that keeps the sign where the loss refuses
+    the other, else none."""
+    leaves = [jnp.asarray(x) for x in start]
+    return [
+        t
+        or (
+            _one_sided(leaves[k])
+            if leaves[k].size and refuses(_replaced(leaves, k, _flipped(leaves[k])))
+            else unconstrained()
+        )
+        for k, t in enumerate(given)
+    ]
+
+
 def _one_sided(x: Any) -> Transform:
     """The transform of a leaf that keeps its sign."""
     value = np.asarray(x)

@@ -19,7 +19,7 @@ FARTHEST = 5.0
 """The longest step: a parameter in logarithms changes by less than a factor 150."""
 SMALLEST = 1e-7
 """The radius below which no step is tried."""
-LOOKS = np.log(10.0) * np.array([1, 2, 4, 6, 8])
+LOOKS = np.log(10.0) * np.array([1, 2, 4, 6, 8, 12, 16, 24, 32])
 """How far it looks around from an optimum, both ways along each parameter that has a bound: a
 factor 10 and 100, and on while the loss is flat there. What is lower starts another descent."""
 SURE_LOOKS = 2

@@ -99,6 +99,14 @@ ROWS = (
         predicts_back=True,
     ),
     Row(
+        "ewif_bank",
+        lambda model: ej.ewif_bank(model, lambda p: p["tau"] * jnp.asarray([0.5, 1.0, 3.0])),
+        late=Status.LATE_USED,
+        any_age=True,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
+    Row(
         "limited_memory",
         lambda model: ej.limited_memory(model, of("window"), 8),
         late=Status.LATE_USED,

@@ -1,5 +1,6 @@
 """`ewif-jax track` on files that are right, late, repeated, and wrong."""
 
+import re
 from pathlib import Path
 
 import jax
@@ -77,6 +78,10 @@ def test_tuning_finds_a_better_filter(two_tracks, tmp_path, capsys):
     assert median["validity", "tuned"] <= median["validity", "before"] * 1.001
     assert median["validity", "tuned"] < 3.0
     assert (table["scored"].groupby("times").nunique() == 1).all()
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"tau = [\d.]+ ± [\d.]+ s \(validity times\)", said)
+    assert re.search(r"[\d.]+ fitted, [\d.]+ held out, with the standard error by leaving", said)
+    assert re.search(r"Ended: (converged|at a bound|out of steps)", said)
     estimates = pd.read_csv(out / "track" / "estimates.csv")
     assert (estimates["status"] == "late_used").sum() == 1
     assert estimates["time"].min() > 1.6e9
@@ -84,7 +89,7 @@ def test_tuning_finds_a_better_filter(two_tracks, tmp_path, capsys):
     newest = estimates.groupby("track")["time"].cummax()
     np.testing.assert_allclose(estimates["estimate_time"], newest, rtol=1e-15)
     assert (estimates["estimate_time"] > estimates["time"]).sum() == 1
-    assert "1 late used" in capsys.readouterr().out
+    assert "1 late used" in said
     for name in ("tracks", "innovations", "tuning"):
         assert (out / "track" / f"{name}.png").stat().st_size > 20_000
 

@@ -101,7 +101,7 @@ def _track(parser: argparse.ArgumentParser) -> None:
         help="of the prediction errors: their median, mean length (robust), "
         "root mean square, or the likelihood",
     )
-    tuning.add_argument("--steps", type=whole(1), default=200, help="gradient steps (200)")
+    tuning.add_argument("--steps", type=whole(1), default=200, help="evaluations, at most (200)")
     tuning.add_argument(
         "--warm-up", type=whole(0), default=5, help="first rows of a track not scored (5)"
     )

@@ -5,20 +5,20 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import optax
 import pandas as pd
 import xarray as xr
 
 from ewif_jax.fast.compiling import array
 from ewif_jax.lab.plane import to_degrees
-from ewif_jax.study.shared.experiment import Experiment, Options
+from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown
 from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track import figures as track_figures
+from ewif_jax.study.track.held_out import HeldOut, held_out
 from ewif_jax.study.track.loss import filtered, loss, predicted, report
 from ewif_jax.study.track.method import Method, method
 from ewif_jax.study.track.readings import Readings, read
 from ewif_jax.study.track.tracks import Tracks, batch
-from ewif_jax.tuning import tune
+from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Measurement, Status
 
 AXES = "xyz"
@@ -110,24 +110,56 @@ def _outcome(
         return Outcome(stamps, before, after, (float(start), float(start)), None)
     label = f"tuning {chosen.name} ({stamps} times)"
     with experiment.timed(label), experiment.progress(label) as progress:
-        tuned = tune(
-            loss(arguments.loss, chosen, batches, tracks.grouped(counted, False)),
-            {chosen.name: start},
-            steps=arguments.steps,
-            optimizer=_optimizer(arguments.steps),
-            transforms=chosen.transform,
-            progress=progress,
+        price = loss(arguments.loss, chosen, batches)
+
+        def search(params: dict[str, Any], rows: list[np.ndarray], told: Any = None) -> Tuned:
+            return tune(
+                price,
+                {**params, "counted": rows},
+                fixed="counted",
+                steps=arguments.steps,
+                transforms={chosen.name: chosen.transform},
+                progress=told,
+            )
+
+        rows = [np.asarray(x, float) for x in tracks.grouped(counted, False)]
+        tuned = search({chosen.name: start}, rows, progress)
+    with experiment.timed(f"{chosen.name} without some rows ({stamps} times)"):
+        checked = held_out(
+            price,
+            lambda params, kept: float(search(params, kept).params[chosen.name]),
+            chosen.name,
+            float(tuned.params[chosen.name]),
+            tracks,
+            counted,
         )
+    _tell(experiment, stamps, chosen, LABEL[arguments.loss], tuned, checked)
     with experiment.timed("filtering"):
-        after = filtered(chosen, {**chosen.params, **tuned.params}, tracks, batches)
+        best = {chosen.name: tuned.params[chosen.name]}
+        after = filtered(chosen, {**chosen.params, **best}, tracks, batches)
     value = float(start), float(tuned.params[chosen.name])
     return Outcome(stamps, before, after, value, tuned.history)
 
 
-def _optimizer(steps: int) -> optax.GradientTransformation:
-    """Adam with a short memory: the loss can fall tenfold on the way, and steps that remember the
-    first gradients (b2 = 0.999) would stop short of the optimum."""
-    return optax.adam(optax.cosine_decay_schedule(0.1, steps), b2=0.9)
+def _tell(
+    experiment: Experiment,
+    stamps: str,
+    chosen: Method,
+    label: str,
+    tuned: Tuned,
+    checked: HeldOut | None,
+) -> None:
+    """Says how far the parameter is known, what it is worth on other rows, and why it ended."""
+    value = tuned.params[chosen.name]
+    number = Measured(float(value), np.nan) if checked is None else checked.value
+    said = [f"{chosen.name} = {shown(number)} {chosen.unit} ({stamps} times)"]
+    if checked is not None:
+        groups = f"{checked.groups} groups of {checked.of}"
+        said.append(
+            f"{label}: {checked.fitted:.4g} fitted, {checked.held_out:.4g} held out, with the "
+            f"standard error by leaving out {groups}"
+        )
+    experiment.say(f"{'; '.join(said)}. Ended: {tuned.reason}.")
 
 
 def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:

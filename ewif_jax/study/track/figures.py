@@ -80,15 +80,15 @@ def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
 
 
 def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
-    """Parameter and loss by gradient step."""
+    """Parameter and loss by evaluation."""
     figure, (left, right) = canvas(1, 2, width=10, height=4)
     for outcome, color in zip(outcomes, (EWIF, KALMAN), strict=False):
         text = f"{outcome.stamps} times: {outcome.value[1]:.3g} {unit}"
         left.semilogy(outcome.history["params"][name], color=color, label=text)
         right.plot(outcome.history["loss"], color=color)
     left.legend(frameon=False, fontsize="small")
-    label(left, "gradient step", f"{name} [{unit}]")
-    label(right, "gradient step", loss)
+    label(left, "evaluation", f"{name} [{unit}]")
+    label(right, "evaluation", loss)
     plain_ticks(left)
     return figure
 

@@ -66,11 +66,9 @@ Batches = Sequence[tuple[np.ndarray, Measurement]]
 """which tracks, and their measurements (G, T, ...)"""
 
 
-def loss(
-    kind: str, method: Method, batches: Batches, counted: Sequence[np.ndarray]
-) -> Callable[[Any], Array]:
-    """The loss of the tunable parameter: params -> (), over the arrivals `counted` (G, T) of each
-    batch; those that the filter does not predict are charged."""
+def loss(kind: str, method: Method, batches: Batches) -> Callable[[Any], Array]:
+    """The loss of the tunable parameter: params -> (), over the arrivals that params["counted"]
+    (G, T) of each batch says (1 or 0); those that the filter does not predict are charged."""
     score, cost, finish = LOSSES[kind]
     charged = [
         value_charging(
@@ -84,9 +82,10 @@ def loss(
     ]
 
     def loss_of_params(params: Params) -> Array:
-        given = {**method.params, **params}
+        counted = params["counted"]
+        given = {**method.params, **{k: x for k, x in params.items() if k != "counted"}}
         every = [
-            jnp.where(here, charging.scored(given, None, score), jnp.nan).ravel()
+            jnp.where(here > 0, charging.scored(given, None, score), jnp.nan).ravel()
             for charging, here in zip(charged, counted, strict=True)
         ]
         return finish(jnp.concatenate(every))

@@ -23,6 +23,7 @@ from ewif_jax.study.papers.sine import figures as sine_figures
 from ewif_jax.study.papers.two_sided import runs as two_sided
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
+from ewif_jax.transforms import positive
 from ewif_jax.tuning import tune
 from ewif_jax.types import Estimator
 
@@ -141,6 +142,10 @@ def _smoothers(experiment: Experiment) -> None:
     )
 
 
+DESCENT: Any = {"method": "adam", "transforms": positive()}
+"""Small steps, which make a path to draw; sigma_w counts squared, so its sign is not found."""
+
+
 def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
     """Gradient descent on a training batch, and on the exact error from both starts at once: the
     loss is their mean and the optimizer treats each number by itself, so neither sees the other."""
@@ -152,12 +157,14 @@ def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
         training = simulate_batch(sine(dt=DT, r=VARIANCE), keys)
         data = training.measurements, training.truth
         loss = rmse_loss(one.estimator, *data, prior=None, t0=0.0)
-        sampled = tune(loss, {name: np.asarray(one.starts[1])}, steps=steps, progress=report)
+        start = {name: np.asarray(one.starts[1])}
+        sampled = tune(loss, start, **DESCENT, steps=steps, progress=report)
     label = f"{one.name}: tuning on the exact error"
     with experiment.timed(label), experiment.progress(label) as report:
         exact = tune(
             lambda params: jnp.mean(one.exact(params[name])),
             {name: jnp.asarray(one.starts)},
+            **DESCENT,
             steps=steps,
             progress=report,
         )

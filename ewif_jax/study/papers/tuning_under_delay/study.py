@@ -141,7 +141,8 @@ def _tuned(
     start = {one.parameter: one.published, "cutoff": 2.0}
     with experiment.timed(label), experiment.progress(label) as report:
         loss = rmse_loss(soft, seen.measurements, seen.truth, **setting)
-        return tune(loss, start, steps=20 if experiment.options.quick else 80, progress=report)
+        steps = 20 if experiment.options.quick else 80
+        return tune(loss, start, method="adam", steps=steps, progress=report)
 
 
 def _rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
