@@ -46,7 +46,7 @@ from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
-from ewif_jax.live import arrivals, step, step_batch
+from ewif_jax.live import arrivals, forecast, step, step_batch
 from ewif_jax.losses import (
     likelihood_loss,
     log_likelihood,
@@ -145,6 +145,7 @@ __all__ = [
     "fading",
     "fixed_lag",
     "fixed_lag_ewif",
+    "forecast",
     "gain_history",
     "information",
     "kalman",

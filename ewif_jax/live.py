@@ -1,5 +1,5 @@
 """Filtering as measurements come in: one arrival (`step`), one for each of many tracks
-(`step_batch`), and the arrivals of a stream one by one (`arrivals`)."""
+(`step_batch`), the arrivals of a stream one by one (`arrivals`), and a look ahead (`forecast`)."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -19,7 +19,18 @@ from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.fast.slopes import with_few_slopes
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.sensor_range import check_sensor
-from ewif_jax.types import Estimator, Info, Measurement, Params, PyTree, RandomKey, State
+from ewif_jax.models.steps import check_steps
+from ewif_jax.types import (
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    PyTree,
+    RandomKey,
+    State,
+)
 
 
 def step(
@@ -100,6 +111,31 @@ def step_batch(
     )
 
 
+def forecast(estimator: Estimator, params: Params, state: State, times: Numbers) -> Gaussian:
+    """What a filter expects at `times`: means (T, n) and covariances (T, n, n).
+
+    Each time is predicted straight from the state, which stays as it is. Estimators that do not
+    move back are NaN at a time before the state's.
+
+    Args:
+        estimator: any `Estimator`.
+        params: what its parameters are read from.
+        state: from `estimator.init`, `step`, or the `final_state` of `run`.
+        times: (T,) in seconds, in any order.
+
+    Raises:
+        ValueError: times that are not one axis of finite numbers; known times between two steps
+            of a discrete model.
+    """
+    checks.estimator(estimator)
+    checks.shape("times", times, ("T",))
+    checks.finite("times", times)
+    dtype = state.time.dtype
+    model = estimator.model
+    check_steps(None if model is None else model.steps, times, state.time, dtype, "times", False)
+    return _forecast(estimator, params, state, jnp.asarray(times, dtype))
+
+
 def arrivals(measurements: Measurement) -> Iterator[Measurement]:
     """The arrivals of a stream (T, ...) one by one, for `step`; taking one costs a microsecond.
 
@@ -151,6 +187,14 @@ def _stepped(
     return arrival.kept, marked(arrival.info, refused)
 
 
+def _forecasts(estimator: Estimator, params: Params, state: State, times: Array) -> Gaussian:
+    def predicted(time: Array) -> Gaussian:
+        return estimator.estimate(params, estimator.predict(params, state, time))
+
+    return jax.vmap(predicted)(times)
+
+
+_forecast = quick_jit(_forecasts, ("estimator",), QUICKEST)
 _step = quick_jit(_stepped, ("estimator",), QUICKEST)
 
 

@@ -137,3 +137,29 @@ def test_a_stream_gives_its_arrivals_at_no_cost():
     count = sum(1 for _ in ej.arrivals(stream))
     assert count == 10_000
     assert time.process_time() - begin < 1.0
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_forecast_is_the_motion_from_the_state(name):
+    one = jax.tree.map(lambda x: x[1], TRACKS_AT_ONCE)
+    state = ej.run(METHODS[name], PARAMS, one, prior=PRIOR, t0=0.0).final_state
+    mean, cov = METHODS[name].estimate(PARAMS, state)
+    ahead = np.array([0.5, 4.0, 1.0])
+    found = ej.forecast(METHODS[name], PARAMS, state, state.time + ahead)
+    for k, dt in enumerate(ahead):
+        F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
+        Q = PARAMS["q"] * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+        agree(found.mean[k], F @ mean)
+        grown = np.exp(dt / PARAMS["tau"]) if name == "ewif" else 1.0
+        agree(found.cov[k], F @ cov @ F.T * grown + (0 if name == "ewif" else Q))
+
+
+def test_a_forecast_refuses_what_is_no_time():
+    state = METHODS["kalman"].init(PARAMS, PRIOR, 0.0)
+    for times in (np.array(1.0), np.array([1.0, np.nan])):
+        with pytest.raises(ValueError, match="times: expected"):
+            ej.forecast(METHODS["kalman"], PARAMS, state, times)
+    textbook = ej.kalman(ej.linear_model(np.eye(1), np.eye(1), np.eye(1), np.eye(1)))
+    state = textbook.init(None, ej.Gaussian(np.zeros(1), np.eye(1)), 0.0)
+    with pytest.raises(ValueError, match=r"times: expected whole steps"):
+        ej.forecast(textbook, None, state, np.array([1.0, 2.5]))

@@ -195,9 +195,14 @@ def _least(n: int) -> Callable[[Array, Array], Array]:
     def least(R: Array, cov: Array) -> Array:
         share = cholesky.negligible(n, cov.dtype)
         noise, spread = ([x[k, k] for k in range(x.shape[0])] for x in (R, cov))
+        exact = [r == 0 for r in noise]
         # What is absent has the same of both.
-        exact = [(r <= share**2 * s) | (r == s) for r, s in zip(noise, spread, strict=True)]
-        return jnp.where(reduce(jnp.logical_and, exact), 64 * share, share**2).astype(cov.dtype)
+        nothing_else = [e | (r == s) for e, r, s in zip(exact, noise, spread, strict=True)]
+        some, only = (
+            reduce(op, x) for op, x in ((jnp.logical_or, exact), (jnp.logical_and, nothing_else))
+        )
+        # Noise, however small beside what was known, makes no variance that is rounding alone.
+        return jnp.where(some, jnp.where(only, 64 * share, share**2), 0).astype(cov.dtype)
 
     return least
 
