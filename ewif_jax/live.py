@@ -102,7 +102,7 @@ def step_batch(
     same_runs("state", state, every, runs)
     marks = ranked(measurement, (0, 1, 0, 1))
     same_runs("measurement", measurement, marks, runs)
-    check_times(estimator.model, measurement, None, state.time.dtype)
+    _check_steps_of_tracks(estimator, state, measurement)
     for k in {0, *lowest(params, flags)}:
         own = one_run((params, measurement), (flags, marks), k)
         _check_arrival(estimator, own[0], state, own[1]._replace(sensor=_largest(measurement)))
@@ -149,6 +149,18 @@ def arrivals(measurements: Measurement) -> Iterator[Measurement]:
 def _largest(measurement: Measurement) -> Any:
     index = checks.concrete_value(measurement.sensor)
     return measurement.sensor if index is None else np.int32(index.max(initial=0))
+
+
+def _check_steps_of_tracks(estimator: Estimator, state: State, measurement: Measurement) -> None:
+    """Refuses known times that are not whole steps from the time of their own track; where nothing
+    arrived there is no time."""
+    steps = None if estimator.model is None else estimator.model.steps
+    given = (measurement.time, measurement.mask, state.time)
+    time, mask, start = map(checks.concrete_value, given)
+    if steps is None or time is None or mask is None or start is None:
+        return
+    stamps = np.where(mask.any(-1), time, start)
+    check_steps(steps, stamps[:, None], start[:, None], state.time.dtype, "measurement.time")
 
 
 def _check_arrival(

@@ -163,3 +163,20 @@ def test_a_forecast_refuses_what_is_no_time():
     state = textbook.init(None, ej.Gaussian(np.zeros(1), np.eye(1)), 0.0)
     with pytest.raises(ValueError, match=r"times: expected whole steps"):
         ej.forecast(textbook, None, state, np.array([1.0, 2.5]))
+
+
+def test_tracks_of_a_discrete_model_count_their_own_steps():
+    """At other phases and far apart; where nothing arrived, any time will do."""
+    textbook = ej.kalman(ej.linear_model(np.eye(1), np.eye(1), np.eye(1), np.eye(1), max_steps=9))
+    start = np.array([0.0, 500.25, 3.5])
+    prior = ej.Gaussian(np.zeros(1), np.eye(1))
+    states = jax.vmap(lambda t0: textbook.init(None, prior, t0))(start)
+    mask = np.array([[True], [True], [False]])
+    arrived = ej.Measurement(
+        start + np.array([1.0, 2.0, 0.3]), np.ones((3, 1)), np.zeros(3, int), mask
+    )
+    kept, info = ej.step_batch(textbook, None, states, arrived)
+    np.testing.assert_allclose(kept.mean[:, 0], [2 / 3, 3 / 4, 0.0])
+    assert list(info.status) == [ej.Status.USED, ej.Status.USED, ej.Status.MASKED]
+    with pytest.raises(ValueError, match=r"measurement\.time: expected whole steps"):
+        ej.step_batch(textbook, None, states, arrived._replace(time=start + 0.5))

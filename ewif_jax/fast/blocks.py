@@ -114,11 +114,11 @@ def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 # writing is adding there, and the transpose of adding leaves the slopes of the whole as they are
 # (0.17 s). Example: whole = [0, 0, 0] and new = [x] at 1 give [0, x, 0]; slopes [p, q, r] go to new
 # as [q] and to whole as [p, q, r], where nobody reads the q of a constant zero. Rows that the group
-# before has written (`known`) are not zeros; their slopes stay with that group. (README.md: "Slopes
-# of a group are added to the whole".)
+# before has written (`already_there`) are not zeros; their slopes stay with that group.
+# (README.md: "Slopes of a group are added to the whole".)
 @jax.custom_jvp
 def _placed(whole: Array, new: Array, at: Array, already_there: Array | int) -> Array:
-    """`new` in its place in `whole`, which has zeros there, but for `known` first rows of `new`."""
+    """`new` in its place in `whole`, which has zeros there, but for the first rows of `new`."""
     del already_there
     return lax.dynamic_update_slice(whole, new, tuple(at))
 
