@@ -1,6 +1,7 @@
 """From the scores of rows to one number: what the losses have in common."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +9,9 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.charges import WIDTH
-from ewif_jax.charging import Charging
+from ewif_jax.charging import Charging, Rows, Unused, value_charging
 from ewif_jax.scores import Score, average
-from ewif_jax.types import Numbers, Params
+from ewif_jax.types import Estimator, Measurement, Numbers, Params
 
 Loss = Callable[..., Array]
 
@@ -48,6 +49,25 @@ def consistency_of(charging: Charging, truth: Numbers, score: Score) -> Loss:
 
 
 _WIDE = float(np.log(WIDTH**2) ** 2)
+
+
+def of_predictions(
+    estimator: Estimator,
+    measurements: Measurement,
+    setting: dict[str, Any],
+    unused: Unused,
+    rows: Rows,
+    ahead: Numbers,
+    cost: Callable[..., Any],
+    finish: Callable[[Charging], Loss],
+) -> Loss:
+    """What `finish` makes of predictions `ahead`, whose rows cost `cost` where they are missing."""
+
+    def build(horizon: int) -> Loss:
+        some = rows._replace(ahead=horizon)
+        return finish(value_charging(estimator, measurements, cost, unused, setting, some))
+
+    return over_horizons(ahead, build)
 
 
 def over_horizons(ahead: Numbers, build: Callable[[int], Loss]) -> Loss:

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax import scores
-from ewif_jax.averages import averaged, itself, or_infinite, over_horizons
+from ewif_jax.averages import averaged, itself, of_predictions, or_infinite
 from ewif_jax.charges import crps_cost, energy_cost, squared_cost
-from ewif_jax.charging import Charging, Rows, Unused, value_charging
+from ewif_jax.charging import Charging, Rows, Unused
 from ewif_jax.scores import Score
 from ewif_jax.types import Estimator, Measurement, Numbers, Params
 
@@ -46,7 +46,7 @@ def crps_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    return _predicted(
+    return of_predictions(
         estimator, measurements, setting, unused, Rows(where, warm_up), ahead, crps_cost,
         lambda charging: averaged(charging, None, scores.crps, itself),
     )  # fmt: skip
@@ -78,7 +78,7 @@ def energy_loss(
 
     Reduces to: `crps_loss` for one component.
     """
-    return _predicted(
+    return of_predictions(
         estimator, measurements, setting, unused, Rows(where, warm_up), ahead, energy_cost,
         lambda charging: averaged(charging, None, scores.energy, itself),
     )  # fmt: skip
@@ -110,27 +110,10 @@ def nis_shape_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode almost everywhere.
     """
-    return _predicted(
+    return of_predictions(
         estimator, measurements, setting, unused, Rows(where, warm_up), ahead, squared_cost,
         lambda charging: _shape(charging, scores.surprise),
     )  # fmt: skip
-
-
-def _predicted(
-    estimator: Estimator,
-    measurements: Measurement,
-    setting: dict[str, Any],
-    unused: Unused,
-    rows: Rows,
-    ahead: Numbers,
-    cost: Callable[..., Any],
-    finish: Callable[[Charging], Loss],
-) -> Loss:
-    def build(horizon: int) -> Loss:
-        some = rows._replace(ahead=horizon)
-        return finish(value_charging(estimator, measurements, cost, unused, setting, some))
-
-    return over_horizons(ahead, build)
 
 
 def _shape(charging: Charging, score: Score) -> Loss:

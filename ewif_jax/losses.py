@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks, scores
-from ewif_jax.averages import averaged, consistency_of, itself, or_infinite, over_horizons, root_of
+from ewif_jax.averages import averaged, consistency_of, itself, of_predictions, or_infinite, root_of
 from ewif_jax.charges import density_cost, length_cost, squared_cost
 from ewif_jax.charging import Rows, Unused, truth_charging, value_charging
 from ewif_jax.forecast_losses import crps_loss, energy_loss, nis_shape_loss
@@ -117,13 +117,10 @@ def likelihood_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-
-    def build(horizon: int) -> Loss:
-        rows = Rows(where, warm_up, horizon)
-        charging = value_charging(estimator, measurements, density_cost, unused, setting, rows)
-        return averaged(charging, None, scores.negative_log_likelihood, itself)
-
-    return over_horizons(ahead, build)
+    return of_predictions(
+        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, density_cost,
+        lambda charging: averaged(charging, None, scores.negative_log_likelihood, itself),
+    )  # fmt: skip
 
 
 def log_likelihood(
@@ -182,16 +179,15 @@ def prediction_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-    cost = length_cost if robust else squared_cost
-
-    def build(horizon: int) -> Loss:
-        rows = Rows(where, warm_up, horizon)
-        charging = value_charging(estimator, measurements, cost, unused, setting, rows)
-        if robust:
-            return averaged(charging, None, scores.robust_innovation, itself)
-        return averaged(charging, None, scores.squared_innovation, root_of)
-
-    return over_horizons(ahead, build)
+    score, finish, cost = (
+        (scores.robust_innovation, itself, length_cost)
+        if robust
+        else (scores.squared_innovation, root_of, squared_cost)
+    )
+    return of_predictions(
+        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, cost,
+        lambda charging: averaged(charging, None, score, finish),
+    )  # fmt: skip
 
 
 def nees_loss(
@@ -246,10 +242,7 @@ def nis_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
-
-    def build(horizon: int) -> Loss:
-        rows = Rows(where, warm_up, horizon)
-        charging = value_charging(estimator, measurements, squared_cost, unused, setting, rows)
-        return consistency_of(charging, None, scores.normalised_innovation)
-
-    return over_horizons(ahead, build)
+    return of_predictions(
+        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, squared_cost,
+        lambda charging: consistency_of(charging, None, scores.normalised_innovation),
+    )  # fmt: skip
