@@ -100,8 +100,8 @@ class Charging(NamedTuple):
 
     def raw(self, params: Params, truth: Numbers, score: Score) -> Array:
         """Scores (R, T); NaN where the filter has no answer, and in rows left out by the user."""
-        checks.require(self.unused in ("charge", "leave out"), "unused",
-                       "'charge' or 'leave out'", repr(self.unused))  # fmt: skip
+        is_offered = self.unused in ("charge", "leave out")
+        checks.require(is_offered, "unused", "'charge' or 'leave out'", repr(self.unused))
         rows, components = self.rows.apart(self.measurements)
         if components is not None:
             score = scores.of_components(score, truth is None)
@@ -155,10 +155,10 @@ def charging_of(
         with jax.ensure_compile_time_eval():
             return fresh(unknowns)
 
-    known = _is_concrete(measurements) and not isinstance(rows.where, Tracer)
+    is_concrete = _is_concrete(measurements) and not isinstance(rows.where, Tracer)
     if rows.ahead > 1:
         estimator = ahead(estimator, rows.ahead, np.shape(measurements.value)[-1])
-    return Charging(estimator, measurements, setting, kept if known else fresh, unused, rows)
+    return Charging(estimator, measurements, setting, kept if is_concrete else fresh, unused, rows)
 
 
 def value_charging(

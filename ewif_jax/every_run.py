@@ -1,5 +1,6 @@
 """What is refused of every run of a batch before anything is traced."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -145,19 +146,24 @@ def check_runs(
     for k in sorted({0, *lowest(params, params_f)}):
         own = one_run(params, params_f, k)
         start = prior if k else worst
+
+        def filter_one(params: Params, start: Gaussian | None = start) -> None:
+            validated(estimator, params, measurements, start, t0, times, clock, key)
+
         try:
-            validated(estimator, own, measurements, start, t0, times, clock, key)
+            filter_one(own)
         except (TypeError, ValueError) as error:
-            _name_forgotten(
-                error, own, params_f, runs,
-                lambda shared: validated(
-                    estimator, shared, measurements, start, t0, times, clock, key  # noqa: B023
-                ),
-            )  # fmt: skip
+            _name_forgotten(error, own, params_f, runs, filter_one)
             raise
 
 
-def _name_forgotten(error: Exception, params: Params, flags: PyTree, runs: int, trial: Any) -> None:
+def _name_forgotten(
+    error: Exception,
+    params: Params,
+    flags: PyTree,
+    runs: int,
+    filter_one: Callable[[Params], None],
+) -> None:
     """Raises in place of `error`, with the names of parameters that have a leading axis of runs and
     were not marked, if all is well with the first run of them."""
     pairs = zip(tree_leaves_with_path(params), jax.tree.leaves(flags), strict=True)
@@ -170,7 +176,7 @@ def _name_forgotten(error: Exception, params: Params, flags: PyTree, runs: int, 
         return
     first = jax.tree.map(lambda x, f: x if f or np.shape(x)[:1] != (runs,) else x[0], params, flags)
     try:
-        trial(first)
+        filter_one(first)
     except (TypeError, ValueError):
         return
     raise ValueError(

@@ -46,10 +46,14 @@ def crps_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
+
+    def average_score(charging: Charging) -> Loss:
+        return averaged(charging, None, scores.crps, itself)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, crps_cost,
-        lambda charging: averaged(charging, None, scores.crps, itself),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, crps_cost, average_score
+    )
 
 
 def energy_loss(
@@ -78,10 +82,14 @@ def energy_loss(
 
     Reduces to: `crps_loss` for one component.
     """
+
+    def average_score(charging: Charging) -> Loss:
+        return averaged(charging, None, scores.energy, itself)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, energy_cost,
-        lambda charging: averaged(charging, None, scores.energy, itself),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, energy_cost, average_score
+    )
 
 
 def nis_shape_loss(
@@ -110,10 +118,14 @@ def nis_shape_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode almost everywhere.
     """
+
+    def average_score(charging: Charging) -> Loss:
+        return _shape(charging, scores.surprise)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, squared_cost,
-        lambda charging: _shape(charging, scores.surprise),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, squared_cost, average_score
+    )
 
 
 def _shape(charging: Charging, score: Score) -> Loss:

@@ -33,7 +33,7 @@ from jax import Array
 from ewif_jax import checks, scores
 from ewif_jax.averages import averaged, consistency_of, itself, of_predictions, or_infinite, root_of
 from ewif_jax.charges import density_cost, length_cost, squared_cost
-from ewif_jax.charging import Rows, Unused, truth_charging, value_charging
+from ewif_jax.charging import Charging, Rows, Unused, truth_charging, value_charging
 from ewif_jax.forecast_losses import crps_loss, energy_loss, nis_shape_loss
 from ewif_jax.types import Estimator, Measurement, Numbers, Params
 
@@ -117,10 +117,14 @@ def likelihood_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
+
+    def average_score(charging: Charging) -> Loss:
+        return averaged(charging, None, scores.negative_log_likelihood, itself)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, density_cost,
-        lambda charging: averaged(charging, None, scores.negative_log_likelihood, itself),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, density_cost, average_score
+    )
 
 
 def log_likelihood(
@@ -184,10 +188,14 @@ def prediction_loss(
         if robust
         else (scores.squared_innovation, root_of, squared_cost)
     )
+
+    def average_score(charging: Charging) -> Loss:
+        return averaged(charging, None, score, finish)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, cost,
-        lambda charging: averaged(charging, None, score, finish),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, cost, average_score
+    )
 
 
 def nees_loss(
@@ -242,7 +250,11 @@ def nis_loss(
     Returns:
         A function of `params`, differentiable in forward and reverse mode.
     """
+
+    def average_score(charging: Charging) -> Loss:
+        return consistency_of(charging, None, scores.normalised_innovation)
+
+    rows = Rows(where, warm_up)
     return of_predictions(
-        estimator, measurements, setting, unused, Rows(where, warm_up), ahead, squared_cost,
-        lambda charging: consistency_of(charging, None, scores.normalised_innovation),
-    )  # fmt: skip
+        estimator, measurements, setting, unused, rows, ahead, squared_cost, average_score
+    )

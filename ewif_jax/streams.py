@@ -58,10 +58,8 @@ def stream(
     mask = xp.isfinite(value) if mask is None else xp.asarray(mask)
     mask = mask[:, None] if mask.ndim == 1 else mask
     steps = value.shape[0]
-    checks.require(
-        mask.ndim == 2 and mask.shape[0] == steps and mask.shape[1] in (1, value.shape[1]),
-        "mask", f"shape {(steps,)} or {value.shape}", f"shape {mask.shape}",
-    )  # fmt: skip
+    fits = mask.ndim == 2 and mask.shape[0] == steps and mask.shape[1] in (1, value.shape[1])
+    checks.require(fits, "mask", f"shape {(steps,)} or {value.shape}", f"shape {mask.shape}")
     mask = xp.broadcast_to(mask, value.shape)
     if hidden is not None:
         mask = mask & ~hidden.reshape(value.shape)

@@ -177,10 +177,9 @@ def _minimise(fn: Callable[[Array], Array], low: float, high: float) -> float:
     for _ in range(14):
         grid = np.linspace(a, b, 33)
         values = np.asarray(evaluate(jnp.exp(grid)))
-        checks.require(
-            np.isfinite(values).any(), "bounds", "an interval in which the filter settles",
-            f"no finite gain from {low:g} to {high:g} (more steps, or another dt or m?)",
-        )  # fmt: skip
+        expected = "an interval in which the filter settles"
+        got = f"no finite gain from {low:g} to {high:g} (more steps, or another dt or m?)"
+        checks.require(np.isfinite(values).any(), "bounds", expected, got)
         best = int(np.nanargmin(values))
         a, b = grid[max(best - 1, 0)], grid[min(best + 1, 32)]
     return float(np.exp((a + b) / 2))
@@ -195,10 +194,9 @@ def _nearest_root(fn: Callable[[Array], Array], low: float, high: float, near: f
     if crossing.size == 0:
         nearest = _minimise(lambda x: jnp.abs(fn(x)), low, high)
         least = float(fn(jnp.asarray(nearest)))
-        checks.require(
-            False, "case", f"a value from {low:g} to {high:g} with the same expected error",
-            f"none; nearest is {nearest:.6g}, whose mean square error differs by {least:.3g}",
-        )  # fmt: skip
+        expected = f"a value from {low:g} to {high:g} with the same expected error"
+        got = f"none; nearest is {nearest:.6g}, whose mean square error differs by {least:.3g}"
+        checks.require(False, "case", expected, got)
     k = crossing[np.argmin(np.abs(grid[crossing] + grid[crossing + 1] - 2 * np.log(near)))]
     a, b, sign = grid[k], grid[k + 1], np.sign(value[k])
     for _ in range(9):

@@ -80,10 +80,9 @@ def kalman_bucy(
     checks.prior(checks.needs_prior(prior, "kalman_bucy"))
     _check_times(signal, times)
     dtype = float_dtype(signal.value)
-    check_design(
-        system, fading_rate, params, jnp.asarray(times, dtype)[0],
-        np.shape(prior.mean)[0], np.shape(signal.value)[1],
-    )  # fmt: skip
+    begin = jnp.asarray(times, dtype)[0]
+    state_size, value_size = np.shape(prior.mean)[0], np.shape(signal.value)[1]
+    check_design(system, fading_rate, params, begin, state_size, value_size)
     check_solver(rtol, atol, max_steps)
     samples = Signal(jnp.asarray(signal.time, dtype), jnp.asarray(signal.value, dtype))
     functions, constants = split((*system, fading_rate), dtype)

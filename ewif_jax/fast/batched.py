@@ -200,10 +200,10 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
             [jnp.broadcast_to(x, s) for x, s in zip(xs, shapes, strict=True)] for xs in (at, moved)
         )
 
-        def of(*at: Array) -> tuple[Array, ...]:
+        def outputs(*at: Array) -> tuple[Array, ...]:
             return tuple(_inline(*_merge(live, at, primals), fn=fn, batch=0))
 
-        return jax.jvp(of, tuple(at), tuple(moved))[1]
+        return jax.jvp(outputs, tuple(at), tuple(moved))[1]
 
     return kept_apart(tangent) if fn in _APART else tangent
 
@@ -211,13 +211,13 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
 def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) -> Sequence[Any]:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     unknown = [x.aval for x in args if ad.is_undefined_primal(x)]
-    known = [x for x in args if not ad.is_undefined_primal(x)]
+    fixed = [x for x in args if not ad.is_undefined_primal(x)]
     given = [ad.instantiate_zeros(ct) for ct in cotangents]
     if fn in _ADJOINTS:
         return _kernel_p.bind(*given, fn=_ADJOINTS[fn], batch=batch)
     inner = tuple((x.shape[: x.ndim - batch], x.dtype) for x in unknown)
-    ranks = tuple(x.ndim - batch for x in (*known, *given))
-    out = _kernel_p.bind(*known, *given, fn=_adjoint(fn, linear, inner, ranks), batch=batch)
+    ranks = tuple(x.ndim - batch for x in (*fixed, *given))
+    out = _kernel_p.bind(*fixed, *given, fn=_adjoint(fn, linear, inner, ranks), batch=batch)
     results = iter(_summed(x, aval.shape) for x, aval in zip(out, unknown, strict=True))
     return [next(results) if undefined else None for undefined in linear]
 
@@ -229,23 +229,24 @@ def _adjoint(
     inner: tuple[tuple[tuple[int, ...], Any], ...],
     ranks: tuple[int, ...],
 ) -> Function:
-    """(known arguments, cotangents of the outputs) -> cotangents of the linear arguments."""
+    """(arguments with a value, cotangents of the outputs) -> cotangents of the linear arguments."""
 
     def adjoint(*args: Array) -> tuple[Array, ...]:
         count = linear.count(False)
-        known, given = args[:count], args[count:]
+        fixed, given = args[:count], args[count:]
         runs = jnp.broadcast_shapes(*(x.shape[r:] for x, r in zip(args, ranks, strict=True)))
         unknown = [jax.ShapeDtypeStruct(shape + runs, dtype) for shape, dtype in inner]
-        fixed = tuple(not x for x in linear)
+        is_fixed = tuple(not x for x in linear)
 
-        def of(*xs: Array) -> tuple[Array, ...]:
-            return tuple(_inline(*_merge(fixed, known, _merge(linear, xs, linear)), fn=fn, batch=0))
+        def outputs(*xs: Array) -> tuple[Array, ...]:
+            every = _merge(is_fixed, fixed, _merge(linear, xs, linear))
+            return tuple(_inline(*every, fn=fn, batch=0))
 
         given = tuple(
             jnp.broadcast_to(x, x.shape[:r] + runs)
             for x, r in zip(given, ranks[count:], strict=True)
         )
-        return jax.linear_transpose(of, *unknown)(given)
+        return jax.linear_transpose(outputs, *unknown)(given)
 
     return kept_apart(adjoint) if fn in _APART else adjoint
 

@@ -98,8 +98,8 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
 
     @cache  # the backend, and so what it knows, is there from the first call on
     def quick() -> Any:
-        known = {name: options[name] for name in options if name in _known()}
-        return jax.jit(fn, static_argnames=static_argnames, compiler_options=known)
+        understood = {name: options[name] for name in options if name in _known()}
+        return jax.jit(fn, static_argnames=static_argnames, compiler_options=understood)
 
     @wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:

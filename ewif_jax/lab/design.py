@@ -117,8 +117,8 @@ def designed(
         checks.require(callable(score), f"metrics[{name!r}]", "a score (`ej.scores`)", repr(score))
     limits = dict(limits or {})
     for name, found in limits.items():
-        known = f"one of the metrics {', '.join(metrics)}"
-        checks.require(name in metrics, "limits", known, repr(name))
+        expected = f"one of the metrics {', '.join(metrics)}"
+        checks.require(name in metrics, "limits", expected, repr(name))
         is_limits = isinstance(found, Limits)
         checks.require(is_limits, f"limits[{name!r}]", "lab.Limits(converged=, lost=)", repr(found))
     if warm_up is not None:

@@ -125,10 +125,9 @@ def pareto_figure(
     figure, axes = style.canvas(width=7, height=4.5)
     ax = axes[0, 0]
     for k, (name, look) in enumerate(style.looks(comparison.methods).items()):
-        ax.errorbar(
-            spent[k], value[k], ERRORS * error[k], color=look.color, marker=look.marker, capsize=3,
-            markersize=7, linestyle="none", label=name,
-        )  # fmt: skip
+        drawn: dict[str, Any] = {"color": look.color, "marker": look.marker, "linestyle": "none"}
+        drawn |= {"capsize": 3, "markersize": 7, "label": name}
+        ax.errorbar(spent[k], value[k], ERRORS * error[k], **drawn)
         near: dict[str, Any] = {"textcoords": "offset points", "xytext": (7, 5)}
         ax.annotate(name, (spent[k], value[k]), color=look.color, fontsize="small", **near)
     best = front(spent, value)

@@ -82,8 +82,9 @@ def time_folds(measurements: Measurement, folds: int, gap: float) -> list[Fold]:
         inside = (time >= low) & ((time <= high) if last else (time < high))
         near = (time >= low - gap) & (time <= high + gap)
         fold = Fold(present & ~near, present & inside)
-        got = f"block {k} from {low:.6g} to {high:.6g} s has {fold.held_out.sum()} rows, and " \
-              f"{fold.train.sum()} are left to tune by"  # fmt: skip
+        held_out, train = fold.held_out.sum(), fold.train.sum()
+        got = f"block {k} from {low:.6g} to {high:.6g} s has {held_out} rows, and {train} are left"
+        got += " to tune by"
         ok = bool(fold.train.any() and fold.held_out.any())
         checks.require(ok, "folds", "rows in every block and outside of its gap", got)
         found.append(fold)

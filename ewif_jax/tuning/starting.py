@@ -37,10 +37,8 @@ def start_leaves(starts: PyTree, params: Params) -> list[list[Any]]:
     for tree in trees:
         if isinstance(tree, dict) and isinstance(params, dict):
             tree = {**params, **tree}
-        checks.require(
-            jax.tree.structure(tree) == jax.tree.structure(params), "starts", expected,
-            jax.tree.structure(tree),
-        )  # fmt: skip
+        structure = jax.tree.structure(tree)
+        checks.require(structure == jax.tree.structure(params), "starts", expected, structure)
         like = jax.tree.map(lambda x, p: jnp.asarray(x, p.dtype), tree, params)
         fits = all(
             x.shape == p.shape

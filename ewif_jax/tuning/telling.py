@@ -37,10 +37,8 @@ def tuned_from(
     said = ["fixed" if t is None else transform_name(t) for t in domain.transforms]
     transforms = objective.params(tuple(said), ("fixed",) * len(held))
     reason = _reason(descent, domain.notes, names, steps)
-    return Tuned(
-        params, float(loss[place]), history, reason, descent.lengths[place], transforms, method,
-        len(descent.losses),
-    )  # fmt: skip
+    lowest, length, evaluations = float(loss[place]), descent.lengths[place], len(descent.losses)
+    return Tuned(params, lowest, history, reason, length, transforms, method, evaluations)
 
 
 def _reason(descent: Descent, notes: list[str], names: Sequence[str], steps: int) -> str:
