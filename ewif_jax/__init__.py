@@ -19,11 +19,11 @@ from ewif_jax.analysis.consistency import nees, nis, rmse
 from ewif_jax.analysis.crlb import crlb
 from ewif_jax.analysis.equivalence import equivalent_process_noise, equivalent_tau
 from ewif_jax.analysis.expected import expected_mse
+from ewif_jax.analysis.gain_history import gain_history
 from ewif_jax.analysis.merit import (
     alpha_beta_gains,
     cutoff_delay,
     delayed_gain,
-    gain_history,
     maneuvering_index,
     random_walk_cutoff,
     random_walk_gain,

@@ -58,7 +58,7 @@ def screen(measurements: Measurement, dtype: DTypeLike) -> Screened:
     return Screened(Measurement(time, value, sensor, present & finite[..., None]), refused)
 
 
-def marked(info: Info, refused: Any) -> Info:
+def marked(info: Info, refused: Numbers) -> Info:
     """`info` of screened measurements, with the status of those that were refused."""
     status = jnp.where(refused, jnp.int32(Status.REJECTED), info.status)
     return info._replace(status=status)

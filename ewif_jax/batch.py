@@ -194,7 +194,7 @@ def _loop(
     complete: bool,
     dtype: DTypeLike,
 ) -> Loop:
-    def start(params: Params, prior: Any, key: RandomKey) -> Any:
+    def start(params: Params, prior: Gaussian | None, key: RandomKey) -> Any:
         return initial(estimator, params, prior, t0, dtype, key)
 
     def step(params: Params, state: State, arrival: Numbers) -> tuple[Any, Any]:

@@ -32,7 +32,7 @@ def value_charges(
     cost: Cost,
     unknowns: int,
     ahead: int = 1,
-    components: Any = None,
+    components: Numbers = None,
 ) -> Any:
     """What each row (R, T) costs where the filter does not predict it.
 
@@ -66,7 +66,7 @@ def value_charges(
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
-def _foreseen(mask: Any, unknowns: int, ahead: int) -> Any:
+def _foreseen(mask: Numbers, unknowns: int, ahead: int) -> Any:
     """Which rows (R, T) are measured, `ahead` measured rows after `unknowns` components have
     been."""
     measured = mask.any(-1)
@@ -79,7 +79,7 @@ def _foreseen(mask: Any, unknowns: int, ahead: int) -> Any:
 
 
 def truth_charges(
-    truth: Numbers, measurements: Measurement, unknowns: int, components: Any = None
+    truth: Numbers, measurements: Measurement, unknowns: int, components: Numbers = None
 ) -> Any:
     """The squared distance (R, T) or (T,) of the truth (..., k) from its mean over runs and rows.
 
@@ -142,13 +142,13 @@ def density_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     return xp.where(present, log, 0).sum(-1)
 
 
-def charged(values: Array, charge: Any) -> Array:
+def charged(values: Array, charge: Numbers) -> Array:
     """Scores (R, T) with the charge in the rows that have none, NaN in those that do not count."""
     charge = jnp.broadcast_to(jnp.asarray(charge, values.dtype), values.shape)
     return jnp.where(jnp.isnan(charge), jnp.nan, jnp.where(jnp.isnan(values), charge, values))
 
 
-def _in_dtype(charge: Any, value: Numbers) -> Any:
+def _in_dtype(charge: Numbers, value: Numbers) -> Any:
     """In the dtype of the scores of these values; what it cannot hold is infinite."""
     with np.errstate(over="ignore"):
         return charge.astype(float_dtype(value))
@@ -177,7 +177,7 @@ def _about_the_mean(value: Numbers, present: Numbers, sensor: Numbers) -> tuple[
     return error.reshape(shape), spread.reshape(shape)
 
 
-def _sums(x: Numbers, group: Any, groups: int) -> Any:
+def _sums(x: Numbers, group: Numbers, groups: int) -> Any:
     """Sums (groups, m) of the rows of x (N, m) in each group."""
     if isinstance(x, np.ndarray):
         return np.stack([np.bincount(group, column, groups) for column in x.T], -1)

@@ -39,7 +39,7 @@ def from_rows(argument: str, x: Numbers) -> np.ndarray:
         raise ValueError(f"{argument}: expected rows of equal lengths, got {error}") from error
 
 
-def require(condition: Any, argument: str, expected: str, got: Any) -> None:
+def require(condition: object, argument: str, expected: str, got: object) -> None:
     """Raises a ValueError naming `argument` unless `condition` holds."""
     if not condition:
         raise ValueError(f"{argument}: expected {expected}, got {got}")

@@ -58,7 +58,7 @@ def in_seconds(
     return plain.numbers(name, time), t0, times
 
 
-def _seconds(argument: str, stamps: Stamps, first: Any) -> np.ndarray:
+def _seconds(argument: str, stamps: Stamps, first: Numbers) -> np.ndarray:
     """float64 seconds since `first` of date-times, or of durations."""
     value = stamps.value
     gone = np.isnat(value)
@@ -203,7 +203,7 @@ def not_ahead(dtype: DTypeLike, time: Numbers, mask: Numbers, times: Numbers, t0
     )
 
 
-def slack(xp: Any, stamp: Any, clock: Any) -> Any:
+def slack(xp: Any, stamp: Numbers, clock: Numbers) -> Any:
     """What rounding may put between two equal times that were computed in different ways."""
     return 4 * xp.finfo(stamp.dtype).eps * xp.maximum(xp.abs(stamp), xp.abs(clock))
 

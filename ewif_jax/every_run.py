@@ -99,7 +99,7 @@ def flagged(
     return (params, measurements, prior, times), flags
 
 
-def per_run_flags(argument: str, prefix: Any, tree: PyTree) -> Any:
+def per_run_flags(argument: str, prefix: PyTree, tree: PyTree) -> Any:
     """A bool for each leaf of `tree` from a prefix of it.
 
     Raises:
@@ -249,6 +249,6 @@ def _least_definite(cov: np.ndarray, scale: np.ndarray) -> int:
     return int(np.argmin(left.min(1)))
 
 
-def ranked(fields: Any, ranks: tuple[int, ...]) -> Any:
+def ranked(fields: PyTree, ranks: tuple[int, ...]) -> Any:
     """Which fields of a named tuple have more axes than one run needs."""
     return type(fields)(*(jnp.ndim(x) > rank for x, rank in zip(fields, ranks, strict=True)))

@@ -228,7 +228,7 @@ def _stepped_batch(
         del params, key
         return state
 
-    def one_step(params: Params, state: State, arrived: Any) -> tuple[Any, Any]:
+    def one_step(params: Params, state: State, arrived: PyTree) -> tuple[Any, Any]:
         return _stepped(estimator, params, state, arrived[0])
 
     def all_tracks(params: Params, states: State, measurement: Measurement) -> tuple[Any, Any]:

@@ -122,7 +122,7 @@ def _run_parallel(
         own, passed = stretch
         return form.recentred(form.joined(way.carried(state, passed, own.time), own))
 
-    def filtered(state: InformationState, arrival: tuple[Measurement, Any]) -> tuple[Any, Any]:
+    def filtered(state: InformationState, arrival: tuple[Measurement, Array]) -> tuple[Any, Any]:
         measurement, time = arrival
         moved = arrive(estimator, params, state, measurement)
         shown = moved.reported

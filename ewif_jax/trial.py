@@ -18,7 +18,7 @@ from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.wide_prior import check_prior_width, first_rows
 from ewif_jax.recipe import digest
 from ewif_jax.streams import cast, float_dtype
-from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params, RandomKey
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Params, PyTree, RandomKey
 
 
 def validated(
@@ -91,7 +91,7 @@ def validated(
     return state
 
 
-def _require_same_shapes(before: Any, after: Any) -> None:
+def _require_same_shapes(before: PyTree, after: PyTree) -> None:
     """Refuses what a step leaves in other shapes: a parameter that is an array where a number was
     meant."""
     old, new = (jax.tree.map(jnp.shape, x) for x in (before, after))
@@ -111,7 +111,7 @@ def _name_parameters(params: Params, error: TypeError) -> None:
         ) from error
 
 
-def _question(estimator: Estimator, setting: Hashable, values: Any) -> Hashable | None:
+def _question(estimator: Estimator, setting: Hashable, values: PyTree) -> Hashable | None:
     """What tells this trial from others; None while something is being traced."""
     filtered = question_of(estimator)
     leaves, structure = jax.tree.flatten(values)

@@ -1,7 +1,7 @@
 """What exponential data weighting does to a discrete filter: Anderson (1973), section 5."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -243,7 +243,7 @@ def _steady_state(system: System, weighted: Array) -> SteadyState:
 
 
 def check_system(
-    name: str, system: System, n: tuple[int, ...], steps: int | None = None, m: Any = "m"
+    name: str, system: System, n: tuple[int, ...], steps: int | None = None, m: Numbers = "m"
 ) -> None:
     """Refuses matrices of a system of n states that do not fit each other, are not finite, or are
     no covariances; `steps` is the length of those that are stacked (None: none may be)."""

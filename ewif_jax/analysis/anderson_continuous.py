@@ -1,6 +1,6 @@
 """What exponential data weighting does to a continuous filter: Anderson (1973), section 4."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.stabilising import continuous_lyapunov, stabilising_care
 from ewif_jax.analysis.stability import require_steady_state
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Params
+from ewif_jax.types import Numbers, Params
 
 
 class ContinuousSystem(NamedTuple):
@@ -114,11 +114,11 @@ def weighting_as_input_noise(noise: Array, cov: Array, fading_rate: Array) -> Ar
 def check_continuous(
     name: str,
     system: ContinuousSystem,
-    n: Any = None,
-    m: Any = "m",
+    n: Numbers = None,
+    m: Numbers = "m",
     *,
     params: Params = None,
-    start: Any = None,
+    start: Numbers = None,
 ) -> None:
     """Refuses matrices of a system of n states and m measurements that do not fit each other, are
     not finite, or are no densities; functions of time are looked at at `start` (None: refused)."""

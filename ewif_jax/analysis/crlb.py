@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ def crlb(
     state: State,
     time: Numbers,
     weight: Callable[..., Array] | None = None,
-    information: Any = None,
+    information: Numbers = None,
 ) -> Array:
     r"""The bound (n, n) on the error covariance at `time`, when nothing but the start is unknown.
 

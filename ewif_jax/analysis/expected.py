@@ -1,7 +1,6 @@
 """The exact error of a linear filter along a given truth, without sampling."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ def expected_mse(
     measurements: Measurement,
     truth: Array,
     *,
-    noise_cov: Any,
+    noise_cov: Numbers,
     prior: Gaussian | None,
     t0: Numbers,
     times: Numbers = None,

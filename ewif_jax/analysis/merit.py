@@ -1,8 +1,7 @@
 """What a late measurement is still worth: its gain in the ideal filter (Yoder et al. 2018)."""
 
 import operator
-from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +12,10 @@ from ewif_jax import checks
 from ewif_jax.analysis.powers import last_time_above, real_power
 from ewif_jax.analysis.riccati import gain
 from ewif_jax.analysis.stabilising import check_seen_noise, predicted_dare
+from ewif_jax.types import Numbers
 
 
-def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
+def steady_state_gain(F: Numbers, H: Numbers, Q: Numbers, R: Numbers) -> Array:
     r"""The gain K (n, m) of the Kalman filter after many equal steps.
 
     .. math::
@@ -42,7 +42,7 @@ def steady_state_gain(F: Any, H: Any, Q: Any, R: Any) -> Array:
     return _steady_gain(*_system(F, H, Q, R))
 
 
-def delayed_gain(F: Any, H: Any, Q: Any, R: Any, steps: Any) -> Array:
+def delayed_gain(F: Numbers, H: Numbers, Q: Numbers, R: Numbers, steps: Numbers) -> Array:
     r"""The gain (n, m) that the ideal filter gives to a measurement `steps` intervals old.
 
     .. math::
@@ -67,7 +67,9 @@ def delayed_gain(F: Any, H: Any, Q: Any, R: Any, steps: Any) -> Array:
     return _delayed(*system, jnp.asarray(steps, system[0].dtype))
 
 
-def cutoff_delay(F: Any, H: Any, Q: Any, R: Any, *, ratio: Any = 0.6, interval: Any = 1.0) -> Array:
+def cutoff_delay(
+    F: Numbers, H: Numbers, Q: Numbers, R: Numbers, *, ratio: Numbers = 0.6, interval: Numbers = 1.0
+) -> Array:
     r"""The delay T_d () in seconds from which on the gain stays below `ratio` of a fresh one's.
 
     .. math::
@@ -107,7 +109,10 @@ def cutoff_delay(F: Any, H: Any, Q: Any, R: Any, *, ratio: Any = 0.6, interval: 
 
 
 def maneuvering_index(
-    q: Any, r: Any, interval: Any, motion: Literal["random_walk", "acceleration"] = "random_walk"
+    q: Numbers,
+    r: Numbers,
+    interval: Numbers,
+    motion: Literal["random_walk", "acceleration"] = "random_walk",
 ) -> Array:
     r"""The dimensionless ratio lambda () of motion to measurement noise.
 
@@ -132,7 +137,7 @@ def maneuvering_index(
     return jnp.sqrt(jnp.asarray(q) / r) * jnp.asarray(interval) ** power
 
 
-def random_walk_gain(index: Any) -> Array:
+def random_walk_gain(index: Numbers) -> Array:
     r"""The steady gain k () of a random walk.
 
     .. math::
@@ -151,7 +156,7 @@ def random_walk_gain(index: Any) -> Array:
     return 2 * index / (index + jnp.hypot(index, 2))
 
 
-def random_walk_cutoff(index: Any, *, ratio: Any = 0.6, interval: Any = 1.0) -> Array:
+def random_walk_cutoff(index: Numbers, *, ratio: Numbers = 0.6, interval: Numbers = 1.0) -> Array:
     r"""T_d () in seconds of eq. (8) for a random walk, with
     :math:`\log(1 - k) = -2\,\mathrm{asinh}(\lambda / 2)`.
 
@@ -169,7 +174,7 @@ def random_walk_cutoff(index: Any, *, ratio: Any = 0.6, interval: Any = 1.0) -> 
     return -interval * jnp.log(ratio) / (2 * jnp.arcsinh(index / 2))
 
 
-def alpha_beta_gains(index: Any) -> tuple[Array, Array]:
+def alpha_beta_gains(index: Numbers) -> tuple[Array, Array]:
     r"""alpha and beta () of the steady gain K = (alpha, beta / dT) for piecewise constant
     acceleration.
 
@@ -193,7 +198,7 @@ def alpha_beta_gains(index: Any) -> tuple[Array, Array]:
     return rest * (2 - rest), 2 * rest**2
 
 
-def alpha_beta_eigenvalues(index: Any) -> Array:
+def alpha_beta_eigenvalues(index: Numbers) -> Array:
     r"""The two eigenvalues (2,), complex, of (I - K H) F for `alpha_beta_gains`.
 
     .. math::
@@ -208,74 +213,6 @@ def alpha_beta_eigenvalues(index: Any) -> Array:
     half = (alpha + beta) / 2
     root = jnp.sqrt(lax.complex(half**2 - beta, jnp.zeros_like(beta)))
     return 1 - half + jnp.stack([root, -root])
-
-
-class GainHistory(NamedTuple):
-    """gain (T, L+1, n, m): gain[j, l] is the weight of measurement j - l in estimate j, zero where
-    l > j; initial (T, n, n): the weight of the first prediction in estimate j."""
-
-    gain: Array
-    initial: Array
-
-
-def gain_history(F: Any, H: Any, Q: Any, R: Any, first_cov: Any, lag: int) -> GainHistory:
-    r"""The weights of the last `lag` + 1 measurements in every estimate of a Kalman filter.
-
-    .. math::
-        k_{j,0} = K_j, \quad k_{j,l} = (I - K_j H) F_{j-1} k_{j-1,l-1}
-
-    Algorithm 1 of Yoder et al. for any dimension and any spacing of the measurements.
-
-    Args:
-        F, Q: (T-1, n, n), from measurement j to j + 1; for irregular times put each interval's in.
-        H, R: (m, n), (m, m).
-        first_cov: (n, n) predicted covariance at the first measurement.
-        lag: how many earlier measurements to follow, >= 0.
-
-    Raises:
-        ValueError: wrong shapes; numbers that are not finite; first_cov or a Q not PSD; R not
-            positive definite; lag < 0.
-
-    Reduces to: `delayed_gain` for equal intervals after many steps.
-
-    Deviations: as printed k(j,0) lacks h, the gains are shifted by the wrong index, and c^p(1) is
-        not given.
-    """
-    lag = checks.whole("lag", lag, 0)
-    F, H, Q, R, cov = (jnp.asarray(x, jnp.result_type(float, F)) for x in (F, H, Q, R, first_cov))
-    checks.shape("F", F, ("T-1", "n", "n"))
-    n, m = F.shape[1], H.shape[0]
-    checks.shape("Q", Q, F.shape)
-    checks.shape("H", H, ("m", n))
-    checks.shape("R", R, (m, m))
-    checks.shape("first_cov", cov, (n, n))
-    checks.finite("F", F)
-    checks.finite("H", H)
-    for k, one in enumerate(() if checks.concrete_value(Q) is None else np.asarray(Q)):
-        checks.psd(f"Q[{k}]", one)
-    checks.psd("R", R, definite=True)
-    checks.psd("first_cov", cov)
-    return _followed(F, H, Q, R, cov, lag)
-
-
-@partial(jax.jit, static_argnames="lag")
-def _followed(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> GainHistory:
-    m, n = H.shape
-    eye = jnp.eye(n, dtype=F.dtype)
-
-    def body(carry: tuple, motion: tuple[Array, Array]) -> tuple[tuple, GainHistory]:
-        cov, gains, initial = carry
-        K = gain(cov, H, R)
-        kept = eye - K @ H
-        gains = jnp.concatenate([K[None], jnp.einsum("ij,ljm->lim", kept, gains[:-1])])
-        found = GainHistory(gains, kept @ initial)
-        F, Q = motion
-        cov = F @ (kept @ cov @ kept.T + K @ R @ K.T) @ F.T + Q
-        return (cov, jnp.einsum("ij,ljm->lim", F, gains), F @ found.initial), found
-
-    still = (jnp.concatenate([F, eye[None]]), jnp.concatenate([Q, jnp.zeros_like(eye)[None]]))
-    start = (cov, jnp.zeros((lag + 1, n, m), F.dtype), eye)
-    return lax.scan(body, start, still)[1]
 
 
 @jax.jit
@@ -302,14 +239,14 @@ def _cutoff(F: Array, H: Array, Q: Array, R: Array, ratio: Array) -> Array:
     return last_time_above(loop, K, ratio)
 
 
-def _fraction(ratio: Any) -> None:
+def _fraction(ratio: Numbers) -> None:
     value = checks.concrete_value(ratio)
     if value is not None:
         good = np.all((value > 0) & (value < 1))
         checks.require(good, "ratio", "a number between 0 and 1", ratio)
 
 
-def _system(F: Any, H: Any, Q: Any, R: Any) -> tuple[Array, Array, Array, Array]:
+def _system(F: Numbers, H: Numbers, Q: Numbers, R: Numbers) -> tuple[Array, Array, Array, Array]:
     """The four matrices in one float dtype; numbers become (1, 1)."""
     matrices = [jnp.atleast_2d(jnp.asarray(x)) for x in (F, H, Q, R)]
     dtype = jnp.result_type(*matrices)

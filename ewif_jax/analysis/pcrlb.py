@@ -1,7 +1,6 @@
 """What no filter can beat: the posterior Cramer-Rao bound, with and without late measurements."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,7 @@ def pcrlb(
     measurements: Measurement,
     truth: Numbers,
     *,
-    start: Any,
+    start: Numbers,
     prior_cov: Parameter,
     t0: Numbers,
 ) -> Array:
@@ -84,7 +83,7 @@ def pcrlb_late(
     measurements: Measurement,
     truth: Numbers,
     *,
-    start: Any,
+    start: Numbers,
     prior_cov: Parameter,
     t0: Numbers,
     times: Numbers,
@@ -136,7 +135,7 @@ def pcrlb_equivalent(
     measurements: Measurement,
     truth: Numbers,
     *,
-    start: Any,
+    start: Numbers,
     prior_cov: Parameter,
     t0: Numbers,
     times: Numbers,
@@ -285,7 +284,7 @@ def _checked(
     params: Params,
     measurements: Measurement,
     truth: Numbers,
-    start: Any,
+    start: Numbers,
     prior_cov: Parameter,
     t0: Numbers,
 ) -> tuple[Measurement, Array, Bound]:

@@ -46,12 +46,12 @@ class ErrorBounds(NamedTuple):
 def actual_error_continuous(
     system: ContinuousSystem,
     params: Params,
-    cov0: Any,
+    cov0: Numbers,
     *,
     times: Numbers,
     fading_rate: Parameter = 0.0,
     truth: ContinuousSystem | None = None,
-    mean0: Any = None,
+    mean0: Numbers = None,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 65_536,
@@ -115,7 +115,7 @@ def actual_error_continuous(
 def error_bounds_continuous(
     system: ContinuousSystem,
     params: Params,
-    cov0: Any,
+    cov0: Numbers,
     *,
     times: Numbers,
     fading_rate: Parameter = 0.0,

@@ -167,7 +167,7 @@ def matrices(functions: tuple, constants: tuple, params: Params) -> Callable[[Ar
 
 def solve(
     field: Callable[[Array, Any], Any],
-    start: Any,
+    start: Numbers,
     times: Array,
     rtol: float | None,
     atol: float | None,
@@ -203,7 +203,7 @@ def check_design(
     params: Params,
     start: Array,
     n: int,
-    m: Any = "m",
+    m: Numbers = "m",
 ) -> None:
     """Refuses a filter's system and fading rate as they are at the `start`."""
     check_continuous("system", system, n, m, params=params, start=start)

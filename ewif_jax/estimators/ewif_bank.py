@@ -18,6 +18,7 @@ from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
 from ewif_jax.types import (
+    DTypeLike,
     Estimator,
     Gaussian,
     Info,
@@ -83,7 +84,7 @@ def ewif_bank(model: Model, taus: Parameter, forgetting: Parameter = 0.98) -> Es
     if not callable(forgetting):
         _check_share(forgetting)
 
-    def decays(params: Params, dtype: Any) -> Array:
+    def decays(params: Params, dtype: DTypeLike) -> Array:
         return jnp.asarray(_check_taus(resolve(taus, params)), dtype)
 
     def start(params: Params, prior: Gaussian | None, t0: Array, key: RandomKey) -> BankState:
@@ -157,14 +158,14 @@ def bank_weights(state: BankState) -> Array:
     return jnp.exp(state.log_weights)
 
 
-def _check_taus(taus: Any) -> Any:
+def _check_taus(taus: Parameter) -> Any:
     checks.shape("taus", taus, ("K",))
     checks.require(jnp.shape(taus)[0] > 0, "taus", "at least one decay time", "none")
     checks.positive("taus", taus)
     return taus
 
 
-def _check_share(forgetting: Any) -> None:
+def _check_share(forgetting: Parameter) -> None:
     checks.shape("forgetting", forgetting, ())
     value = checks.concrete_value(forgetting)
     if value is not None:

@@ -22,6 +22,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from ewif_jax.types import DTypeLike
+
 Function = Callable[..., Any]
 _ADJOINTS: dict[Function, Function] = {}
 _CHEAP: set[Function] = set()
@@ -143,12 +145,12 @@ def _jitted(fn: Function) -> Function:
 
 
 @cache
-def _traced(fn: Function, avals: tuple[tuple[tuple[int, ...], Any], ...]) -> ClosedJaxpr:
+def _traced(fn: Function, avals: tuple[tuple[tuple[int, ...], DTypeLike], ...]) -> ClosedJaxpr:
     """`fn` traced, once: the same few kernels come again and again in one program."""
     return jax.make_jaxpr(_flat(fn))(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
 
 
-def _known(fn: Function, args: Sequence[Any]) -> ClosedJaxpr:
+def _known(fn: Function, args: Sequence[Array | ShapedArray]) -> ClosedJaxpr:
     return _traced(fn, tuple((x.shape, x.dtype) for x in args))
 
 
@@ -167,7 +169,7 @@ def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
         return _jitted(fn)(*args)
 
 
-def _batch(args: Sequence[Array], dims: Sequence[Any], *, fn: Function, batch: int) -> Any:
+def _batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, batch: int) -> Any:
     runs = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     args = [
         x[..., None] if d is None else jnp.moveaxis(x, d, -1)
@@ -226,7 +228,7 @@ def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) 
 def _adjoint(
     fn: Function,
     linear: tuple[bool, ...],
-    inner: tuple[tuple[tuple[int, ...], Any], ...],
+    inner: tuple[tuple[tuple[int, ...], DTypeLike], ...],
     ranks: tuple[int, ...],
 ) -> Function:
     """(arguments with a value, cotangents of the outputs) -> cotangents of the linear arguments."""

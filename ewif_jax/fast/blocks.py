@@ -33,7 +33,7 @@ class Place(NamedTuple):
 def scan_in_blocks(
     step: Callable[[Any, Any], tuple[Any, Any]],
     state: State,
-    arrivals: Any,
+    arrivals: PyTree,
     finish: Callable[[Any], Any],
     portion: Portion,
     place: Place | None,
@@ -136,11 +136,11 @@ def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return _placed(whole, new, at, already_there), slope
 
 
-def rows(shapes: Any) -> Any:
+def rows(shapes: PyTree) -> Any:
     """Zeros for what is to be shown, (R, T, ...), a row for each run."""
     return jax.tree.map(lambda x: jnp.zeros((x.shape[0], x.size // x.shape[0]), x.dtype), shapes)
 
 
-def unrolled(whole: Any, shapes: Any) -> Any:
+def unrolled(whole: PyTree, shapes: PyTree) -> Any:
     """What is shown, (R, T, ...), from a row for each run."""
     return jax.tree.map(lambda x, shape: x.reshape(shape.shape), whole, shapes)

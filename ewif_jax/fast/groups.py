@@ -186,7 +186,7 @@ def in_groups(
             x = jnp.concatenate([x[: begins[-2] + size], x[begins[-1] :]])
         return x.reshape(groups, size, *x.shape[1:])
 
-    def one_group(whole: Any, numbered: PyTree) -> tuple[Any, Any]:
+    def one_group(whole: PyTree, numbered: PyTree) -> tuple[Any, Any]:
         begin, known, group = numbered
         return fn(merged(group, begin), Place(whole, begin, known))
 

@@ -17,7 +17,7 @@ from ewif_jax.types import Numbers, PyTree
 
 
 def vmap_last(
-    fn: Callable[..., Any], in_flags: Any, out_flags: Any, runs: int
+    fn: Callable[..., Any], in_flags: PyTree, out_flags: PyTree, runs: int
 ) -> Callable[..., Any]:
     """`fn` mapped over the last axis, of `runs`, of the flagged inputs; its flagged outputs have
     one."""
@@ -34,7 +34,7 @@ def parted(tree: PyTree, flags: PyTree) -> tuple[list[Any], list[Any]]:
     return [x for x, f in pairs if f], [x for x, f in pairs if not f]
 
 
-def joined(flagged: Sequence[Any], others: Sequence[Any], flags: PyTree) -> Any:
+def joined(flagged: Sequence[PyTree], others: Sequence[PyTree], flags: PyTree) -> Any:
     """The tree whose leaves `parted` would part into these."""
     marked, rest = iter(flagged), iter(others)
     return jax.tree.map(lambda f: next(marked) if f else next(rest), flags)
@@ -137,7 +137,7 @@ def device_count(runs: int, devices: int | None) -> int:
     return max(d for d in range(1, limit + 1) if runs % d == 0)
 
 
-def broadcast_prefix(prefix: Any, tree: PyTree) -> Any:
+def broadcast_prefix(prefix: PyTree, tree: PyTree) -> Any:
     """A pytree of bools like `tree` from a prefix of it."""
     return jax.tree.map(bool, jax.tree.broadcast(prefix, tree))
 

@@ -111,7 +111,7 @@ def _traced_run(loop: Loop, single: Inputs, per_run: Inputs) -> OneRun:
     return OneRun(start, step, *differ)
 
 
-def _portion_of(run: OneRun, shown: Any, per_run: Inputs, value: Array, ahead: bool) -> Portion:
+def _portion_of(run: OneRun, shown: PyTree, per_run: Inputs, value: Array, ahead: bool) -> Portion:
     """How many runs and steps at a time, for an estimate of such a size."""
     runs, steps, _ = value.shape
     own, shared, largest = _sizes(run.start.outputs, run.state_differs, shown)
@@ -128,7 +128,9 @@ def _portion_of(run: OneRun, shown: Any, per_run: Inputs, value: Array, ahead: b
     return Portion(size, block, together)
 
 
-def _that_differ(step: Traced, params_f: Any, state_f: Any, arrival_f: Any) -> tuple[Any, Any]:
+def _that_differ(
+    step: Traced, params_f: PyTree, state_f: PyTree, arrival_f: PyTree
+) -> tuple[Any, Any]:
     """Which leaves of the state, and of what is observed, differ by run (pytrees of bools)."""
     while True:
         later_f, seen_f = dependence(step, (params_f, state_f, arrival_f))
@@ -142,11 +144,11 @@ def _levels(flags: PyTree, shared: int) -> Any:
     return jax.tree.map(lambda f: 2 if f else shared, flags)
 
 
-def _first(arrivals: Any) -> Any:
+def _first(arrivals: PyTree) -> Any:
     return jax.tree.map(lambda x: x[0], arrivals)
 
 
-def _sizes(state: State, state_f: Any, shown: Any) -> tuple[int, int, int]:
+def _sizes(state: State, state_f: PyTree, shown: PyTree) -> tuple[int, int, int]:
     """The bytes of a run's own state, of the state that all share, and of the largest array in one
     or in an estimate."""
     sizes, estimated = (
@@ -161,7 +163,7 @@ def _shared_ahead(
     parts: Divided,
     inputs: Inputs,
     per_run: Inputs,
-    differ: tuple[Any, Any],
+    differ: tuple[PyTree, PyTree],
     portion: Portion,
 ) -> tuple[Any, Any]:
     """What all runs share is computed first, once for all groups, which then read what they need
@@ -179,7 +181,7 @@ def _shared_ahead(
     arrivals = parted(inputs.arrivals, per_run.arrivals)[1]
     last, (seen, needed) = lax.scan(step_ahead, state, arrivals, steps)
 
-    def start(params: Params, prior: Any, key: RandomKey) -> Any:
+    def start(params: Params, prior: PyTree, key: RandomKey) -> Any:
         return parted(loop.start(params, prior, key), state_differs)[0]
 
     def step(params: Params, state: list[Array], arrival: Numbers) -> tuple[Any, Any]:
@@ -203,7 +205,7 @@ def _shared_ahead(
 
 
 def _in_groups(
-    loop: Loop, inputs: Inputs, per_run: Inputs, differ: Sequence[Any], portion: Portion
+    loop: Loop, inputs: Inputs, per_run: Inputs, differ: Sequence[PyTree], portion: Portion
 ) -> tuple[Any, Any]:
     alone = _alike((per_run, differ))
 
@@ -222,7 +224,7 @@ def _scanned(
     loop: Loop,
     inputs: Inputs,
     per_run: Inputs,
-    differ: Sequence[Any],
+    differ: Sequence[PyTree],
     portion: Portion,
     place: Place | None,
 ) -> tuple[Any, Any]:

@@ -127,11 +127,11 @@ def _in_columns(
     return out, jax.tree.map(lambda x, column: _along(x, column, taken), out, columns)
 
 
-def _stacked(parts: Sequence[Any]) -> Any:
+def _stacked(parts: Sequence[Array]) -> Any:
     return parts[0] if parts[0].dtype == float0 else jnp.stack(parts)
 
 
-def _along(value: Array, columns: Any, steps: Sequence[Array]) -> Any:
+def _along(value: Array, columns: Array, steps: Sequence[Array]) -> Any:
     """How far a value moves if every number takes its step, () or (R,)."""
     if not jnp.issubdtype(value.dtype, jnp.floating):
         return np.zeros(value.shape, float0)

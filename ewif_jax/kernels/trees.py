@@ -9,7 +9,7 @@ from jax import Array
 from ewif_jax.types import PyTree
 
 
-def choose(condition: Array, yes: Any, no: Any) -> Any:
+def choose(condition: Array, yes: PyTree, no: PyTree) -> Any:
     """`yes` where the scalar `condition` holds, else `no`, for whole pytrees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 

@@ -12,7 +12,7 @@ from ewif_jax import checks
 from ewif_jax.analysis.consistency import nis
 from ewif_jax.monte_carlo import Statistics
 from ewif_jax.tuning import Tuned
-from ewif_jax.types import Status, Trace
+from ewif_jax.types import Numbers, Status, Trace
 
 
 def to_frame(trace: Trace, names: Sequence[str] | None = None) -> pd.DataFrame:
@@ -82,7 +82,7 @@ def _of_trace(trace: Trace, names: Sequence[str] | None) -> xr.Dataset:
     info = trace.info
     lead = ("run", "step") if np.ndim(trace.mean) == 3 else ("step",)
 
-    def over_steps(x: Any, *tail: str) -> Any:
+    def over_steps(x: Numbers, *tail: str) -> Any:
         x = np.asarray(x)
         short = x.ndim < len(lead) + len(tail)
         return ((lead[1:] if short else lead) + tail, x)

@@ -23,7 +23,7 @@ from ewif_jax.lab.store import InFolder, InMemory, Store
 from ewif_jax.lab.tuned import tuned_params
 from ewif_jax.monte_carlo import Scenario
 from ewif_jax.scores import Score
-from ewif_jax.types import Estimator, RandomKey
+from ewif_jax.types import Estimator, PyTree, RandomKey
 
 LEAST_RUNS = 20
 """before which a standard error is not believed"""
@@ -130,7 +130,7 @@ def _filled(
 
 def _compute_all(
     design: Design,
-    tuned: Any,
+    tuned: PyTree,
     units: Sequence[Unit],
     store: Store,
     executor: Executor | None,
@@ -155,7 +155,7 @@ def _compute_all(
 
 def _until_enough(
     design: Design,
-    tuned: Any,
+    tuned: PyTree,
     store: Store,
     executor: Executor | None,
     devices: int | None,

@@ -17,7 +17,7 @@ from ewif_jax.lab.parametric import Simulate
 from ewif_jax.monte_carlo import RUN_STEPS, Scenario, Simulation, one_run, takes_params
 from ewif_jax.scores import Score, squared_error, squared_innovation
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Gaussian, RandomKey
+from ewif_jax.types import DTypeLike, Gaussian, Numbers, Params, RandomKey
 
 MOST_RUNS = 1_000_000
 """At a point of the grid, where runs are added until errors are small enough."""
@@ -173,7 +173,7 @@ def _size(runs: int | str, most_runs: int | None) -> tuple[int, float | None]:
     return checks.whole("most_runs", most_runs or MOST_RUNS, 2), share
 
 
-def _numbers(name: str, values: Any) -> tuple[float, ...]:
+def _numbers(name: str, values: Numbers) -> tuple[float, ...]:
     where, expected = f"over[{name!r}]", "a list of different numbers"
     checks.require(isinstance(name, str), "over", "names of axes", repr(name))
     taken = name not in ("method", "run", "step", "status", "metric")
@@ -255,7 +255,7 @@ def _check_told(scenario: Scenario, params: Mapping[str, float]) -> None:
 
 
 def _state_size(
-    where: str, method: Method, point: Mapping[str, float], scenario: Scenario, dtype: Any
+    where: str, method: Method, point: Mapping[str, float], scenario: Scenario, dtype: DTypeLike
 ) -> int:
     """How many numbers a method's state has whose estimate it reports.
 
@@ -264,7 +264,7 @@ def _state_size(
     """
     told = method.told_by(scenario)
 
-    def first(params: Any) -> Gaussian:
+    def first(params: Params) -> Gaussian:
         key = jax.random.key(0)
         state = initial(method.estimator, params, told.prior, told.t0, dtype, key)
         return method.estimator.estimate(params, state)

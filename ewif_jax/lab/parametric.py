@@ -10,6 +10,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import content_key
+from ewif_jax.types import Params
 
 
 def parametric(builder: Callable[..., Scenario], **fixed: Any) -> Scenario:
@@ -43,16 +44,16 @@ class Simulate:
         self.builder = builder
         self.fixed = dict(fixed)
 
-    def __call__(self, key: Array, params: Mapping[str, Any]) -> Simulation:
+    def __call__(self, key: Array, params: Params) -> Simulation:
         """A run of the scenario with these numbers."""
         return self._built(params).simulate(key)
 
-    def told(self, params: Mapping[str, Any]) -> tuple[Any, Any]:
+    def told(self, params: Params) -> tuple[Any, Any]:
         """Prior and t0 with these numbers."""
         made = self._built(params)
         return made.prior, made.t0
 
-    def _built(self, params: Mapping[str, Any]) -> Scenario:
+    def _built(self, params: Params) -> Scenario:
         # An axis may be of the methods alone.
         own = {k: v for k, v in params.items() if k in self._names and k not in self.fixed}
         return self.builder(**self.fixed, **own)

@@ -12,7 +12,7 @@ from ewif_jax.analysis.merit import delayed_gain
 from ewif_jax.lab import style
 from ewif_jax.lab.style import ESTIMATE, TRUTH
 from ewif_jax.tuning import Tuned
-from ewif_jax.types import Numbers
+from ewif_jax.types import Numbers, Params
 
 
 def history(tuned: Tuned, *, ax: Axes | None = None) -> Axes:
@@ -43,7 +43,7 @@ def landscape(
     loss: Callable[[Any], Any],
     name: str,
     values: Sequence[float],
-    params: Mapping[str, Any],
+    params: Params,
     *,
     best: float | None = None,
     error: float | None = None,
@@ -119,7 +119,7 @@ def merit_map(
     return ax
 
 
-def _named(params: Any) -> list[tuple[str, np.ndarray]]:
+def _named(params: Params) -> list[tuple[str, np.ndarray]]:
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return [
         (jax.tree_util.keystr(path, simple=True, separator=".") or "params", np.asarray(x))

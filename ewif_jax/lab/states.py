@@ -11,7 +11,7 @@ import numpy as np
 
 from ewif_jax import checks
 from ewif_jax.lab.pieces import Broken, read_piece, write_piece
-from ewif_jax.types import State
+from ewif_jax.types import Numbers, State
 
 FORMAT = 1
 
@@ -67,15 +67,15 @@ def _described(state: State) -> dict[str, str]:
     return {jax.tree_util.keystr(path): f"{_dtype(x)}{list(np.shape(x))}" for path, x in leaves}
 
 
-def _dtype(x: Any) -> str:
+def _dtype(x: Numbers) -> str:
     return str(jax.numpy.result_type(x)) if not checks.is_typed_key(x) else str(x.dtype)
 
 
-def _plain(x: Any) -> np.ndarray:
+def _plain(x: Numbers) -> np.ndarray:
     return np.asarray(jax.random.key_data(x) if checks.is_typed_key(x) else x)
 
 
-def _as_in(like: Any, x: np.ndarray) -> Any:
+def _as_in(like: State, x: np.ndarray) -> Any:
     if checks.is_typed_key(like):
         return jax.random.wrap_key_data(jax.numpy.asarray(x), impl=jax.random.key_impl(like))
     return jax.numpy.asarray(x, jax.numpy.result_type(like))

@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ewif_jax.types import Numbers
+
 TRUTH, MEASURED, ESTIMATE, BAND = "#000000", "#8c96a0", "#0072b2", "#56b4e9"
 """What is true is black in every picture."""
 
@@ -87,7 +89,7 @@ def legend_above(ax: Axes, columns: int = 4) -> None:
 
 
 def robust_limits(
-    ax: Axes, values: Any, *, floor: float | None = None, factor: float = 3.0
+    ax: Axes, values: Numbers, *, floor: float | None = None, factor: float = 3.0
 ) -> None:
     """Limits of the y axis that a few outliers do not blow up: the middle 95 % of `values`, and
     `factor` times as much to each side where values lie there. What is outside is marked by
@@ -114,7 +116,7 @@ def robust_limits(
         ax.annotate(text, (0.99, 0.99), color="#555555", **place)
 
 
-def clipped(ax: Axes, x: Any, y: Any, color: str) -> None:
+def clipped(ax: Axes, x: Numbers, y: Numbers, color: str) -> None:
     """Triangles at the edge of the axes, where points lie outside of its limits."""
     bottom, top = ax.get_ylim()
     x, y = np.asarray(x, float), np.asarray(y, float)

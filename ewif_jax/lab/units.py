@@ -16,7 +16,7 @@ from ewif_jax.lab.timing import timed
 from ewif_jax.monte_carlo import Simulation, run_keys, simulate_batch, step_sums
 from ewif_jax.scores import Score, average, score_of
 from ewif_jax.streams import float_dtype
-from ewif_jax.types import Gaussian, Params, Status
+from ewif_jax.types import DTypeLike, Gaussian, Numbers, Params, PyTree, Status
 
 Arrays = dict[str, np.ndarray]
 STATUSES = len(Status)
@@ -132,7 +132,7 @@ def _one_method(
     )
 
 
-def _stand_in(design: Design, size: int, dtype: Any) -> Gaussian:
+def _stand_in(design: Design, size: int, dtype: DTypeLike) -> Gaussian:
     """What everybody knows at the start, in a state of `size` numbers; NaN if nothing."""
     prior = design.scenario.prior
     if prior is None:
@@ -165,10 +165,10 @@ def _observer(metrics: tuple[tuple[str, Score], ...]) -> Observer:
 
 @partial(jax.jit, static_argnames=("limits", "over_time"))
 def _reduced(
-    seen: Any,
+    seen: PyTree,
     rows: Array,
     times: Array,
-    t0: Any,
+    t0: Numbers,
     real: int,
     limits: tuple[tuple[str, float | None, float | None], ...],
     over_time: bool,

@@ -28,9 +28,9 @@ HALVINGS = 40
 
 @from_recipe
 def from_continuous(
-    A: Any,
-    G: Any,
-    intensity: Any,
+    A: Parameter,
+    G: Parameter,
+    intensity: Parameter,
     sensors: Sensor | Sequence[Sensor] | None = None,
     *,
     H: Parameter = None,

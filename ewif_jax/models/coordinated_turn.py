@@ -1,7 +1,6 @@
 """A target that turns at a rate nobody knows."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +25,7 @@ TURNING = np.diag([0.0, 0.0, 0.0, 0.0, 1.0])
 
 @from_recipe
 def coordinated_turn(
-    *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, q_turn: Any = 0.0
+    *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, q_turn: Parameter = 0.0
 ) -> Model:
     r"""Motion in the plane at a constant, unknown turn rate, with Cartesian velocity.
 

@@ -198,7 +198,7 @@ def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
     return matrix
 
 
-def _nothing(still: Array, whole: Any) -> Array:
+def _nothing(still: Array, whole: Numbers) -> Array:
     """What no step does; NaN where the steps are not whole."""
     return chosen(whole, still, jnp.full_like(still, jnp.nan))
 

@@ -24,7 +24,7 @@ def floating(value: Numbers) -> Any:
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
 
 
-def scaled(factor: Any, matrix: Array) -> Array:
+def scaled(factor: Numbers, matrix: Array) -> Array:
     """factor () times a matrix, also where types may not be promoted silently."""
     if not hasattr(factor, "dtype"):
         return factor * matrix

@@ -17,7 +17,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.types import Parameter, Steps
+from ewif_jax.types import Numbers, Parameter, PyTree, Steps
 
 BITS = 5
 """Of k, which one table looks up: few, or the tables of large matrices would be too big."""
@@ -47,7 +47,7 @@ def tables_of(one: Stride, steps: Steps) -> list[Stride]:
     return tables
 
 
-def looked_up(tables: list[Stride], k: Any) -> Stride:
+def looked_up(tables: list[Stride], k: Numbers) -> Stride:
     """What k steps do by `tables_of`; of tables of F that have as many rows again for the way back,
     k < 0 too. What was not asked for is left out."""
     total = None
@@ -62,7 +62,7 @@ def looked_up(tables: list[Stride], k: Any) -> Stride:
     return total
 
 
-def _row(table: Array, number: Any) -> Array:
+def _row(table: Array, number: Numbers) -> Array:
     return lax.dynamic_index_in_dim(table, number, keepdims=False)
 
 
@@ -77,7 +77,7 @@ def squares_of(F: Parameter, steps: Steps) -> np.ndarray | None:
     return np.stack(squares)
 
 
-def power(one: Stride, k: Any, steps: Steps, squares: np.ndarray | None = None) -> Stride:
+def power(one: Stride, k: Numbers, steps: Steps, squares: np.ndarray | None = None) -> Stride:
     """What k steps do, nothing if k < 0; `squares` is what is known of F over 1, 2, 4, ... steps.
     An F beside b or Q is left out."""
     still = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
@@ -118,7 +118,7 @@ def then(first: Stride, second: Stride, matmul: Callable, matvec: Callable) -> S
     return Stride(None if first.F is None else matmul(second.F, first.F), b, Q)
 
 
-def chosen(condition: Any, first: Any, second: Any) -> Any:
+def chosen(condition: Numbers, first: PyTree, second: PyTree) -> Any:
     """`first` where the condition holds, else `second`."""
     is_concrete = checks.concrete_value(condition)
     if is_concrete is not None:

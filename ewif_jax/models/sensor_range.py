@@ -21,7 +21,7 @@ from ewif_jax.recipe import digest
 from ewif_jax.types import Measurement, Numbers, Params
 
 
-def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: Any) -> None:
+def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: Numbers) -> None:
     """Refuses a known index that the model has no sensor for, or that it clamps where it looks
     something up; a linear model does not need to know the state x."""
     index = checks.concrete_value(sensor)
@@ -75,7 +75,7 @@ def _clamps(model: Model, index: int, inputs: tuple) -> bool:
     """
     linear = model.linear
 
-    def seen(sensor: Numbers, params: Params, x: Numbers, t: Any) -> tuple[Any, Any]:
+    def seen(sensor: Numbers, params: Params, x: Numbers, t: Numbers) -> tuple[Any, Any]:
         R = model.measurement_cov(params, sensor, t)
         if linear is None:
             return model.observe(params, x, sensor, t), R

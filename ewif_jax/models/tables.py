@@ -36,7 +36,7 @@ def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
         return (lambda params, sensor, t: table), 0
     matrices = np.asarray(x, table.dtype)
 
-    def chosen(params: Params, sensor: Any, t: Array) -> Any:
+    def chosen(params: Params, sensor: Numbers, t: Array) -> Any:
         del params, t
         is_number = isinstance(sensor, int | np.integer)
         return matrices[min(sensor, len(matrices) - 1)] if is_number else select(table, sensor)

@@ -34,7 +34,7 @@ def first_rows(measurements: Measurement, prior: Gaussian | None, t0: Numbers) -
 
 
 def check_prior_width(
-    model: Model, params: Params, prior: Gaussian, t0: Numbers, rows: Any, dtype: DTypeLike
+    model: Model, params: Params, prior: Gaussian, t0: Numbers, rows: Numbers, dtype: DTypeLike
 ) -> bool:
     """True, unless a known prior is so wide that the first updates (`first_rows`) leave variances
     that are mostly what a covariance in `dtype` was rounded by: that is refused."""

@@ -12,7 +12,16 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.partial_use import partly
-from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Numbers, Params, RandomKey
+from ewif_jax.types import (
+    Estimator,
+    Gaussian,
+    Info,
+    Measurement,
+    Numbers,
+    Params,
+    PyTree,
+    RandomKey,
+)
 
 
 class ReplayState(NamedTuple):
@@ -91,7 +100,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         stored, share = (None, None) if shares is None else (shares[:-1], shares[-1])
         sorted_in, place = _insert((state.buffer, stored), (_padded(measurement, width), share))
 
-        def filtered(at: Any, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
+        def filtered(at: Numbers, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
             measured, share = entry
             cut = measured._replace(value=measured.value[:size], mask=measured.mask[:size])
             method = estimator if share is None else partly(estimator, share)
@@ -130,7 +139,9 @@ def _padded(measurement: Measurement, width: int) -> Measurement:
     )
 
 
-def _insert(buffer: tuple[Measurement, Any], new: tuple[Measurement, Any]) -> tuple[Any, Array]:
+def _insert(
+    buffer: tuple[Measurement, PyTree], new: tuple[Measurement, PyTree]
+) -> tuple[Any, Array]:
     """The buffer with `new` after everything not newer, and its place."""
     times = buffer[0].time
     place = jnp.sum(times <= new[0].time)

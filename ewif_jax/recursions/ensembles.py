@@ -1,6 +1,6 @@
 """Ensembles: members that stand for a distribution, moved and updated one by one."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model
 from ewif_jax.recursions.innovations import numbers
 from ewif_jax.recursions.sigma_points import view
-from ewif_jax.types import Gaussian, Measurement, Params
+from ewif_jax.types import Gaussian, Measurement, Numbers, Params
 
 
 class EnsembleState(NamedTuple):
@@ -183,7 +183,7 @@ def moments(members: Array) -> Gaussian:
     return Gaussian(mean, spread(members - mean[:, None]))
 
 
-def fuse_ensembles(ensembles: Any) -> Array:
+def fuse_ensembles(ensembles: Numbers) -> Array:
     r"""One ensemble of several that estimate the same state at the same time.
 
     .. math::

@@ -14,7 +14,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.recursions import information
 from ewif_jax.recursions.information import InformationState
-from ewif_jax.types import Estimator, Info, Measurement, Params, State
+from ewif_jax.types import Estimator, Info, Measurement, Params, PyTree, State
 
 
 def prepared(state: State) -> Any:
@@ -46,7 +46,7 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
     return Estimator(init, predict, update, estimate, model=estimator.model)
 
 
-def _mixed(old: Any, new: Any, share: Array) -> Any:
+def _mixed(old: PyTree, new: PyTree, share: Array) -> Any:
     """(1 - share) old + share new, in what makes up the estimate."""
     if isinstance(old, InformationState):
         return information.blended(old, new, share)
@@ -58,5 +58,5 @@ def _mixed(old: Any, new: Any, share: Array) -> Any:
     return new._replace(mean=mean, cov=cov)
 
 
-def _mix(old: Any, new: Any, share: Array) -> Any:
+def _mix(old: PyTree, new: PyTree, share: Array) -> Any:
     return jax.tree.map(lambda a, b: a + share * (b - a), old, new)

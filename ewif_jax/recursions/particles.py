@@ -16,7 +16,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.resampling import Resampling, ancestors, effective_sample_size
 from ewif_jax.models import Model
-from ewif_jax.types import Gaussian, Params, State
+from ewif_jax.types import Gaussian, Params, PyTree, State
 
 
 class ParticleState(NamedTuple):
@@ -108,7 +108,7 @@ def if_later(
 
 
 def step_ahead(
-    kind: Cloud, params: Params, state: State, time: Array, along: Any = ()
+    kind: Cloud, params: Params, state: State, time: Array, along: PyTree = ()
 ) -> tuple[Any, Any]:
     """The state at a later `time`, and what goes along with the particles (pytrees of arrays with
     the particles as the last axis), both resampled first if too few particles count."""
@@ -119,7 +119,7 @@ def step_ahead(
 
 
 def renewed(
-    kind: Cloud, key: Array, state: ParticleLike, along: Any = ()
+    kind: Cloud, key: Array, state: ParticleLike, along: PyTree = ()
 ) -> tuple[ParticleLike, Any]:
     """The state, and what goes along with its particles, resampled if too few of them count."""
     least = kind.ess_threshold * kind.particles
@@ -130,7 +130,7 @@ def renewed(
 
 
 def ready_to_draw(
-    kind: Cloud, state: ParticleLike, along: Any = ()
+    kind: Cloud, state: ParticleLike, along: PyTree = ()
 ) -> tuple[ParticleLike, Any, Array]:
     """The state before new noise is drawn for a late measurement, what goes along with its
     particles, and the key of that noise.
@@ -144,7 +144,7 @@ def ready_to_draw(
 
 
 def refreshed(
-    key: Array, cloud: Any, log_weights: Array, least: float, method: Resampling = "systematic"
+    key: Array, cloud: PyTree, log_weights: Array, least: float, method: Resampling = "systematic"
 ) -> tuple[Any, Array]:
     """`cloud` and its log weights, resampled if fewer than `least` particles count."""
     few = effective_sample_size(log_weights) < least
@@ -157,7 +157,9 @@ def refreshed(
     )
 
 
-def resampled(key: Array, cloud: Any, log_weights: Array, method: Resampling) -> tuple[Any, Array]:
+def resampled(
+    key: Array, cloud: PyTree, log_weights: Array, method: Resampling
+) -> tuple[Any, Array]:
     """Copies of the particles (a pytree, particles last) by their weights, and equal log weights.
 
     The new weights have the value 1 / N and the derivative of the old: their relative change, w /

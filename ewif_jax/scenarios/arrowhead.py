@@ -1,7 +1,5 @@
 """The arrowhead path of Yoder et al., sections 4.2 and 4.3, tracked by models that are wrong."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -115,7 +113,7 @@ def arrowhead_ekf(
     return _delayed(arrowhead_state, r, dt, mean_delay, steps)
 
 
-def _delayed(path: Any, r: Parameter, dt: float, mean_delay: float, steps: int) -> Scenario:
+def _delayed(path: Numbers, r: Parameter, dt: float, mean_delay: float, steps: int) -> Scenario:
     start = path(jnp.asarray(0.0))
     size = start.shape[0]
 

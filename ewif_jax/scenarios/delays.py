@@ -1,6 +1,6 @@
 """When things are measured and when they arrive: sampling, transport delay, loss."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ class Delivery(NamedTuple):
     order: Array
 
 
-def regular_times(interval: Numbers, steps: int, start: Any = 0.0) -> Array:
+def regular_times(interval: Numbers, steps: int, start: Numbers = 0.0) -> Array:
     """(T,) start, start + interval, ... in seconds.
 
     Raises:
@@ -32,7 +32,7 @@ def regular_times(interval: Numbers, steps: int, start: Any = 0.0) -> Array:
     return start + interval * jnp.arange(steps)
 
 
-def poisson_times(key: Array, mean_interval: Any, steps: int, start: Any = 0.0) -> Array:
+def poisson_times(key: Array, mean_interval: Numbers, steps: int, start: Numbers = 0.0) -> Array:
     """(T,) the events of a Poisson process of rate 1 / mean_interval after `start`, seconds.
 
     Raises:
@@ -43,7 +43,7 @@ def poisson_times(key: Array, mean_interval: Any, steps: int, start: Any = 0.0) 
     return start + jnp.cumsum(mean_interval * jax.random.exponential(key, (steps,)))
 
 
-def exponential_delays(key: Array, mean: Any, steps: int) -> Array:
+def exponential_delays(key: Array, mean: Numbers, steps: int) -> Array:
     """(T,) exponentially distributed delays in seconds; `mean` may be () or (T,), zero included.
 
     Raises:
@@ -53,7 +53,7 @@ def exponential_delays(key: Array, mean: Any, steps: int) -> Array:
     return mean * jax.random.exponential(key, (checks.whole("steps", steps, 1),))
 
 
-def uniform_delays(key: Array, low: Any, high: Any, steps: int) -> Array:
+def uniform_delays(key: Array, low: Numbers, high: Numbers, steps: int) -> Array:
     """(T,) delays uniform in [low, high), seconds; the bounds may be () or (T,).
 
     Raises:
@@ -64,7 +64,7 @@ def uniform_delays(key: Array, low: Any, high: Any, steps: int) -> Array:
     return low + (high - low) * jax.random.uniform(key, (checks.whole("steps", steps, 1),))
 
 
-def fixed_delays(delay: Any, steps: int) -> Array:
+def fixed_delays(delay: Numbers, steps: int) -> Array:
     """(T,) the same delay for all, seconds; `delay` may be () or (T,).
 
     Raises:
@@ -74,7 +74,7 @@ def fixed_delays(delay: Any, steps: int) -> Array:
     return jnp.broadcast_to(jnp.asarray(delay), (checks.whole("steps", steps, 1),))
 
 
-def by_sensor(table: Any, sensor: Array) -> Array:
+def by_sensor(table: Numbers, sensor: Array) -> Array:
     """(T,) the entry of `table` (S,) that belongs to each measurement's sensor: per-sensor means,
     bounds or delays for the functions above.
 
@@ -93,7 +93,7 @@ def by_sensor(table: Any, sensor: Array) -> Array:
     return table.at[jnp.asarray(sensor)].get(mode="fill", fill_value=jnp.nan)
 
 
-def losses(key: Array, probability: Any, steps: int) -> Array:
+def losses(key: Array, probability: Numbers, steps: int) -> Array:
     """(T,) True for what never arrives, independently with `probability` () or (T,).
 
     Raises:
@@ -109,10 +109,10 @@ def losses(key: Array, probability: Any, steps: int) -> Array:
 def deliver(
     time: Numbers,
     value: Numbers,
-    delay: Any,
+    delay: Numbers,
     *,
     sensor: Numbers = 0,
-    lost: Any = None,
+    lost: Numbers = None,
     mask: Numbers = None,
 ) -> Delivery:
     """The measurements in their order of arrival, time + delay.

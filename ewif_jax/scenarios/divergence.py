@@ -4,7 +4,7 @@ The filter believes that a scalar stands still, dx = 0, z = x + v with unit nois
 x(0) ~ N(0, 1). In truth x is pushed, by white noise or steadily. Three remedies are compared.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ class Growth(NamedTuple):
 
 
 def divergence_curve(
-    remedy: Remedy, push: Push, time: Numbers, *, eps: Any, setting: Any = None
+    remedy: Remedy, push: Push, time: Numbers, *, eps: Numbers, setting: Numbers = None
 ) -> Array:
     r"""The exact mean square error E|x - x_hat|^2 (T,) of the continuous filter.
 
@@ -72,7 +72,7 @@ def divergence_curve(
 
 
 @from_recipe
-def divergence_filter(remedy: Remedy, *, dt: float, setting: Any = None) -> Estimator:
+def divergence_filter(remedy: Remedy, *, dt: float, setting: Numbers = None) -> Estimator:
     """The filter with a remedy, for the samples of `divergence`.
 
     Args:
@@ -126,7 +126,7 @@ def divergence(push: Push, *, eps: float, dt: float = 0.02, length: float = 20.0
     return Scenario(simulate, Gaussian(jnp.zeros(1), jnp.eye(1)), 0.0)
 
 
-def _error(growth: Growth, push: Push, eps: Any) -> Array:
+def _error(growth: Growth, push: Push, eps: Numbers) -> Array:
     g, of_g, of_square, of_slope, one = growth
     own = one + of_slope
     if push == "white":
@@ -134,7 +134,7 @@ def _error(growth: Growth, push: Push, eps: Any) -> Array:
     return own / g**2 + (eps * of_g / g) ** 2
 
 
-def _growth(remedy: Remedy, t: Array, setting: Any) -> Growth:
+def _growth(remedy: Remedy, t: Array, setting: Numbers) -> Growth:
     if remedy == "none":
         g = 1 + t
         return Growth(g, t + t**2 / 2, t + t**2 + t**3 / 3, t, jnp.ones_like(t))
@@ -166,7 +166,7 @@ def _growth(remedy: Remedy, t: Array, setting: Any) -> Growth:
     )
 
 
-def _check(remedy: str, push: str, setting: Any) -> None:
+def _check(remedy: str, push: str, setting: Numbers) -> None:
     checks.require(remedy in REMEDIES, "remedy", f"one of {REMEDIES}", repr(remedy))
     checks.require(push in PUSHES, "push", f"one of {PUSHES}", repr(push))
     if remedy != "none":

@@ -1,7 +1,5 @@
 """The random walk of Yoder et al., section 4.1: irregular measurements that arrive late."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -11,7 +9,7 @@ from ewif_jax.models import Model, position_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
 from ewif_jax.scenarios.delays import deliver, exponential_delays, poisson_times
-from ewif_jax.types import Gaussian, Parameter
+from ewif_jax.types import Gaussian, Numbers, Parameter
 
 
 @from_recipe
@@ -26,7 +24,7 @@ def random_walk(
     q: Parameter = 25.0,
     r: float = 2500.0,
     mean_interval: float = 0.2,
-    mean_delay: Any = 4.0,
+    mean_delay: Numbers = 4.0,
     steps: int = 5000,
 ) -> Scenario:
     r"""A position driven by white noise, :math:`w \sim N(0, q\,\Delta t)`, measured at the events

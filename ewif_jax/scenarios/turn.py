@@ -1,8 +1,6 @@
 """A fast clockwise turn seen by two bearing sensors and a late third: Orguner & Gustafsson,
 section IV."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +31,7 @@ def turn_state(time: Numbers) -> Array:
 
 
 @from_recipe
-def turn_model(q: Parameter = Q, q_turn: Any = Q_TURN, r: Parameter = NOISE_SD**2) -> Model:
+def turn_model(q: Parameter = Q, q_turn: Parameter = Q_TURN, r: Parameter = NOISE_SD**2) -> Model:
     """A coordinated turn; "sensor" 0 is the pair of bearings from (-200, 0) m and (200, 0) m, and 1
     is the bearing from (-750, 750) m (its second component is always absent).
 

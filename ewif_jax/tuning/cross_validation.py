@@ -11,7 +11,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.tuning.minimise import tune
 from ewif_jax.tuning.tuned import Tuned
-from ewif_jax.types import Measurement, Params
+from ewif_jax.types import Measurement, Params, PyTree
 
 Loss = Callable[..., Array]
 
@@ -149,14 +149,14 @@ def cross_validated(
     )
 
 
-def _stays(fixed: Any, params: Params) -> Any:
+def _stays(fixed: PyTree, params: Params) -> Any:
     if fixed is None:
         return False
     names = [fixed] if isinstance(fixed, str) else fixed
     return {name: name in names for name in params}
 
 
-def _transforms(given: Any, params: Params) -> Any:
+def _transforms(given: PyTree, params: Params) -> Any:
     """Of a mapping that names some parameters, None for the others."""
     both = isinstance(given, dict) and isinstance(params, dict)
     return {**dict.fromkeys(params), **given} if both else given

@@ -11,7 +11,7 @@ import numpy as np
 from ewif_jax.tuning.pricing import Coordinates, Pricer
 from ewif_jax.tuning.programs import Leaves, Objective
 from ewif_jax.tuning.quasi_newton import Asked, Ended
-from ewif_jax.types import Params
+from ewif_jax.types import Params, PyTree
 
 Told = Callable[[int, int, float], None]
 Validation = Callable[[Params], Any]
@@ -160,7 +160,13 @@ def stepping(optimizer: Any, coordinates: Coordinates, objective: Objective) -> 
 
     def build(objective: Objective) -> Callable[..., Any]:
         def taken(
-            free: Leaves, slopes: Leaves, held: Leaves, state: Any, value: Any, scale: Any, key: Any
+            free: Leaves,
+            slopes: Leaves,
+            held: Leaves,
+            state: PyTree,
+            value: PyTree,
+            scale: PyTree,
+            key: PyTree,
         ) -> tuple[list[Any], Any]:
             def loss(tree: Params) -> Any:
                 own = [t.constrain(x) for t, x in zip(transforms, moving(tree), strict=True)]

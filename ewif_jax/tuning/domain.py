@@ -13,7 +13,7 @@ from ewif_jax.fast.layout import broadcast_prefix
 from ewif_jax.transforms import Transform, negative, positive, psd, unconstrained
 from ewif_jax.tuning.pricing import Pricer
 from ewif_jax.tuning.programs import Leaves
-from ewif_jax.types import Params, PyTree
+from ewif_jax.types import Numbers, Params, PyTree
 
 FRACTION = 1e-3
 """Of its scale: how far below 0 a leaf is tried that starts at 0."""
@@ -33,7 +33,7 @@ class Domain(NamedTuple):
     notes: list[str]
 
 
-def held_leaves(fixed: Any, params: Params) -> tuple[Params, list[bool]]:
+def held_leaves(fixed: PyTree, params: Params) -> tuple[Params, list[bool]]:
     """The parameters with the values that are fixed, and which leaves move.
 
     Args:
@@ -64,7 +64,7 @@ def held_leaves(fixed: Any, params: Params) -> tuple[Params, list[bool]]:
     return params, [not bool(x) for x in stays]
 
 
-def given_transforms(transforms: Any, params: Params) -> list[Transform | None]:
+def given_transforms(transforms: PyTree, params: Params) -> list[Transform | None]:
     """The transform given for each leaf; None where it is to be found."""
     count = len(jax.tree.leaves(params))
     if transforms is None:
@@ -135,7 +135,7 @@ def found_domain(
 
 
 def kept_signs(
-    given: Sequence[Transform | None], start: Sequence[Any], refuses: Refuses
+    given: Sequence[Transform | None], start: Sequence[Numbers], refuses: Refuses
 ) -> list[Transform]:
     """The transforms given, and of other leaves: one that keeps the sign where the loss refuses
     the other, else none."""
@@ -151,7 +151,7 @@ def kept_signs(
     ]
 
 
-def _one_sided(x: Any) -> Transform:
+def _one_sided(x: Numbers) -> Transform:
     """The transform of a leaf that keeps its sign."""
     value = np.asarray(x)
     square = value.ndim == 2 and value.shape[0] == value.shape[1]
@@ -162,7 +162,7 @@ def _one_sided(x: Any) -> Transform:
     return negative() if np.all(value < 0) else unconstrained()
 
 
-def _flipped(x: Any) -> Any:
+def _flipped(x: Numbers) -> Any:
     scale = jnp.max(jnp.abs(x))
     return jnp.where(x == 0, -FRACTION * jnp.where(scale > 0, scale, 1), -x)
 

@@ -10,7 +10,7 @@ from jax import Array
 
 from ewif_jax.transforms import Transform, unconstrained
 from ewif_jax.tuning.programs import Leaves, Objective, Priced
-from ewif_jax.types import Params, RandomKey
+from ewif_jax.types import Numbers, Params, RandomKey
 
 
 class Pricer:
@@ -117,7 +117,7 @@ def has_ends(transform: Transform) -> bool:
     return not transform_name(transform).startswith(("unconstrained", "psd"))
 
 
-def as_float(x: Any) -> Params:
+def as_float(x: Numbers) -> Params:
     """A leaf of the parameters as an array of floats."""
     dtype = jnp.asarray(x).dtype
     floating = jnp.issubdtype(dtype, jnp.floating)

@@ -7,12 +7,12 @@ import pytest
 from oracles import late
 from scipy.linalg import expm, logm, solve_discrete_are
 
+from ewif_jax.analysis.gain_history import gain_history
 from ewif_jax.analysis.merit import (
     alpha_beta_eigenvalues,
     alpha_beta_gains,
     cutoff_delay,
     delayed_gain,
-    gain_history,
     maneuvering_index,
     random_walk_cutoff,
     random_walk_gain,

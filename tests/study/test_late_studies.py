@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ewif_jax.analysis.merit import gain_history
+from ewif_jax.analysis.gain_history import gain_history
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.extended import extended
 from ewif_jax.monte_carlo import monte_carlo, simulate_batch

@@ -1,5 +1,6 @@
 """`ewif-jax track`: a filter over the measurements in a CSV file, before and after tuning."""
 
+import argparse
 import hashlib
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from ewif_jax.study.track.method import Method, method
 from ewif_jax.study.track.readings import Readings, read
 from ewif_jax.study.track.tracks import Tracks, batch
 from ewif_jax.tuning import Tuned, tune
-from ewif_jax.types import Measurement, Status
+from ewif_jax.types import Measurement, Params, Status
 
 AXES = "xyz"
 READING = ("time", "date", "arrival", "track", "sensor", "values", "latlon", "decimal", "dates")
@@ -43,7 +44,7 @@ class Outcome(NamedTuple):
     history: dict[str, Any] | None
 
 
-def track(arguments: Any, options: Options) -> None:
+def track(arguments: argparse.Namespace, options: Options) -> None:
     """Reads, filters, tunes if asked to, and reports."""
     given = {name: getattr(arguments, name) for name in READING}
     readings = read(arguments.file, **given)
@@ -60,7 +61,7 @@ def track(arguments: Any, options: Options) -> None:
 
 def _followed(
     experiment: Experiment,
-    arguments: Any,
+    arguments: argparse.Namespace,
     readings: Readings,
     tracks: Tracks,
     counted: np.ndarray,
@@ -92,7 +93,7 @@ def _followed(
 
 def _outcome(
     experiment: Experiment,
-    arguments: Any,
+    arguments: argparse.Namespace,
     chosen: Method,
     stamps: str,
     tracks: Tracks,
@@ -112,7 +113,7 @@ def _outcome(
     with experiment.timed(label), experiment.progress(label) as progress:
         price = loss(arguments.loss, chosen, batches)
 
-        def search(params: dict[str, Any], rows: list[np.ndarray], told: Any = None) -> Tuned:
+        def search(params: Params, rows: list[np.ndarray], told: Any = None) -> Tuned:
             return tune(
                 price,
                 {**params, "counted": rows},
@@ -271,7 +272,7 @@ def state_names(n: int, dims: int) -> list[str]:
     return [prefix + axis for prefix in ("", "v", "a")[: n // dims] for axis in AXES[:dims]]
 
 
-def _settings(arguments: Any) -> dict[str, Any]:
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     left_out = ("action", "out", "overwrite", "runs", "quick", "chunk", "dtype", "seed")
     given = {k: str(v) for k, v in vars(arguments).items() if k not in left_out}
     digest = hashlib.sha256(arguments.file.read_bytes()).hexdigest()[:12]

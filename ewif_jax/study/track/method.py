@@ -1,6 +1,7 @@
 """The filter that `ewif-jax track` runs: model, estimator, parameters and a start that knows
 nothing."""
 
+import argparse
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -57,7 +58,7 @@ class Method(NamedTuple):
         return None if self.prior is None else Gaussian(self.prior.mean[tracks], self.prior.cov)
 
 
-def method(arguments: Any, tracks: Tracks) -> Method:
+def method(arguments: argparse.Namespace, tracks: Tracks) -> Method:
     """The filter that the arguments ask for.
 
     What is not given follows from the noise s and the median interval dt of the measurements:

@@ -34,7 +34,7 @@ TEXT = {
 }
 
 
-def setting_for(remedy: Remedy, gain: Any) -> Any:
+def setting_for(remedy: Remedy, gain: Numbers) -> Any:
     """The setting whose weight on the newest data settles at `gain` in 1/s: q = gain^2,
     alpha = gain / 2, or a memory of 1 / gain seconds; None where there is nothing to set."""
     return {"none": None, "noise": gain**2, "weighting": gain / 2, "memory": 1 / gain}[remedy]
@@ -148,7 +148,7 @@ def _row(
     }
 
 
-def _dataset(time: np.ndarray, found: PyTree, exact: Any, final: Any) -> xr.Dataset:
+def _dataset(time: np.ndarray, found: PyTree, exact: Numbers, final: Numbers) -> xr.Dataset:
     def stacked(x: Numbers, names: tuple[str, ...], last: str) -> xr.DataArray:
         table = np.stack([[x[push, name] for name in names] for push in PUSHES])
         return xr.DataArray(

@@ -10,12 +10,14 @@ import numpy as np
 import xarray as xr
 from jax import Array
 
-from ewif_jax.analysis.merit import delayed_gain, gain_history, steady_state_gain
+from ewif_jax.analysis.gain_history import gain_history
+from ewif_jax.analysis.merit import delayed_gain, steady_state_gain
 from ewif_jax.scenarios.delays import poisson_times
 from ewif_jax.study.papers.gains import figures
 from ewif_jax.study.papers.late_loss.runs import relative_errors
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.late import mean_of
+from ewif_jax.types import Numbers
 
 SETTLING = 400
 AGES = (0, 1, 2, 4, 8)
@@ -74,7 +76,7 @@ def actual(case: Case, keys: Array) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(ages), np.asarray(gains)
 
 
-def closed_form(case: Case, ages: Any) -> np.ndarray:
+def closed_form(case: Case, ages: Numbers) -> np.ndarray:
     """The gain (..., n) of eq. (5), or (7) for a random walk, at `ages` in seconds."""
     system = case.F(case.interval), case.H, case.Q(case.interval), jnp.eye(1)
     if case.H.shape[1] == 1:

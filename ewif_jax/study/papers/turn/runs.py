@@ -20,7 +20,7 @@ from ewif_jax.oosm.replay import replay
 from ewif_jax.scenarios.turn import Q_TURN, SECONDS, Q, turn, turn_model, turn_state
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.one_by_one import over_cores, per_run, tracker
-from ewif_jax.types import Estimator, RandomKey, Status, Trace
+from ewif_jax.types import Estimator, Numbers, RandomKey, Status, Trace
 
 LAG, BUFFER = 5, 12
 STD, ORD, EXT, EXACT = "PFstd", "PFord", "PFoosmEXT", "exact replay"
@@ -102,7 +102,7 @@ def bounds(batch: Simulation) -> Arrays:
         "times": np.repeat(TIMES, 2),
     }
 
-    def errors_of(stream: Any, noise: Any) -> dict[str, Any]:
+    def errors_of(stream: Numbers, noise: Numbers) -> dict[str, Any]:
         bound = pcrlb_late(model, noise, stream, turn_state(stream.time), **setting)[1::2]
         variances = jnp.diagonal(bound, axis1=1, axis2=2)
         return {"position": variances[:, :2].sum(1), "velocity": variances[:, 2:4].sum(1)}

@@ -138,7 +138,7 @@ def _observe(trace: Trace, simulation: Simulation) -> dict[str, Any]:
     }
 
 
-def _variances(cov: Any) -> Any:
+def _variances(cov: Numbers) -> Any:
     """Of x and y (T, 2)."""
     return jnp.stack([cov[:, 0, 0], cov[:, 1, 1]], -1)
 
