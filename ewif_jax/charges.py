@@ -90,15 +90,17 @@ def truth_charges(
     xp = _module(truth, mask)
     truth = np.asarray(truth, float) if xp is np else jnp.asarray(truth)
     axes = tuple(range(truth.ndim - 1))
-    is_given = xp.isfinite(truth).all(-1)
+    is_given = _all_of_each(xp.isfinite(truth))
     filled = xp.where(is_given[..., None], truth, 0)
     mean = filled.sum(axes) / xp.maximum(is_given.sum(), 1)
     apart = filled - xp.broadcast_to(mean, filled.shape)
     if components is not None:
         shape = np.broadcast_shapes(apart.shape, np.shape(components))
         apart = xp.broadcast_to(apart, shape) * xp.asarray(components)
-    charge = xp.square(apart).sum(-1)
-    measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)
+    charge = xp.einsum("...i,...i->...", apart, apart)
+    measured = xp.broadcast_to(unknowns, np.shape(mask)[:-1])
+    if unknowns > 0:
+        measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)
     shape = np.broadcast_shapes(is_given.shape, measured.shape, charge.shape)
     is_given, measured, charge = (xp.broadcast_to(x, shape) for x in (is_given, measured, charge))
     counted = is_given & (measured >= unknowns)
@@ -146,6 +148,13 @@ def charged(values: Array, charge: Numbers) -> Array:
     """Scores (R, T) with the charge in the rows that have none, NaN in those that do not count."""
     charge = jnp.broadcast_to(jnp.asarray(charge, values.dtype), values.shape)
     return jnp.where(jnp.isnan(charge), jnp.nan, jnp.where(jnp.isnan(values), charge, values))
+
+
+def _all_of_each(flags: Any) -> Any:
+    """Whether all of each vector (..., k) are: of a few numbers each, NumPy's reduction is slow."""
+    if isinstance(flags, np.ndarray) and flags.all():
+        return np.ones(flags.shape[:-1], bool)
+    return flags.all(-1)
 
 
 def _in_dtype(charge: Numbers, value: Numbers) -> Any:

@@ -11,6 +11,7 @@ Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,22 +34,23 @@ def times(rows: Array, x: Array) -> Array:
 
 
 def absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array, size: Array | None = None
+    variances: Array, rows: Array, equations: Array, noises: Array, sizes: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Variances and rows with one more `equation` (n,), whose error has variance `noise` ().
-    `size` (n,) of the terms that its coefficients were summed from, where they may cancel.
+    """Variances and rows with further `equations` (m, n), whose errors have variances `noises`
+    (m,). `sizes` (m, n) of the terms that their coefficients were summed from, where they may
+    cancel.
 
-    Also leads and steps (n,): what `answered` needs to do the same to the targets, which are the
+    Also leads and steps (m, n): what `answered` needs to do the same to the targets, which are the
     only part that depends on data. A direction about which nothing is known is learnt from an
     equation only where that is more than the rounding of taking out what is known.
     """
-    sizes = () if size is None else (size,)
-    return _absorbed(variances, rows, equation, noise, *sizes)
+    sizes = jnp.abs(equations) if sizes is None else sizes
+    return _absorbed(variances, rows, equations, noises, sizes)
 
 
-def answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
-    """The targets with one more equation, which says `residual` ()."""
-    return _answered(targets, residual, leads, steps)
+def answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
+    """The targets with further equations, which say `residuals` (m,)."""
+    return _answered(targets, residuals, leads, steps)
 
 
 def leading(rows: Array, equations: Array) -> Array:
@@ -138,99 +140,128 @@ def _times(rows: Array, x: Array) -> Array:
     )
 
 
-def _weighed(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array]:
-    """v r / S, S = r + lead^2 v and lead v / S; v, S and 0 where S is 0."""
-    S, _, a, b = _shares(v, r, lead)
-    return v * a, S, b
-
-
-def _shares(v: Array, r: Array, lead: Array) -> tuple[Array, Array, Array, Array]:
-    """S, 1 / S, r / S and lead v / S."""
-    S = r + lead * (lead * v)
-    some = S > 0
-    q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
-    return S, q, jnp.where(some, r * q, 1), lead * (v * q)
-
-
 @kernel
 def _absorbed(
-    variances: Array, rows: Array, equation: Array, noise: Array, size: Array | None = None
+    variances: Array, rows: Array, equations: Array, noises: Array, sizes: Array
 ) -> tuple[Array, Array, Array, Array]:
-    n, batch = equation.shape[0], equation.ndim - 1
-    scale, found = jnp.abs(equation) if size is None else size, []
+    batch = noises.ndim - 1
+    if len(noises) == 1:
+        one = _one_absorbed(variances, rows, equations[0], noises[0], sizes[0], batch)
+        return one[0], one[1], one[2][None], one[3][None]
+    # A loop, although it has a few rounds only: written out, each would be compiled by itself.
+    given = variances, rows, equations, noises, sizes
+    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in given))
+
+    def widened(x: Array) -> Array:
+        return jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs)
+
+    def add(known: tuple[Array, Array], new: tuple[Array, Array, Array]) -> Any:
+        kept, changed, leads, steps = _one_absorbed(*known, *new, batch)
+        return (kept, changed), (leads, steps)
+
+    kept, told = lax.scan(
+        add, (widened(variances), widened(rows)), tuple(widened(x) for x in given[2:])
+    )
+    return *kept, *told
+
+
+def _one_absorbed(
+    variances: Array, rows: Array, equation: Array, noise: Array, scale: Array, batch: int
+) -> tuple[Array, Array, Array, Array]:
+    # What is left of the equation for each row has to be found one row after the other, and is all
+    # that is: what it does to variances and rows is computed for all rows at once.
+    n = equation.shape[0]
+    unknown = jnp.isinf(variances)
+    finite = jnp.where(unknown, 0, variances)
+    leads, noises, rests = [], [], []
     for k, row in enumerate(_pieces(rows, n)):
-        variance, noise, lead, step = stage(
-            _met(n), variances[k], noise, equation[0], scale[0], batch=batch
+        noises.append(noise)
+        lead, noise = stage(
+            _met(n), variances[k], finite[k], noise, equation[0], scale[0], batch=batch
         )
+        leads.append(lead)
         if k < n - 1:
-            row, equation, scale = stage(
-                _taken_out, row, equation[1:], scale[1:], lead, step, batch=batch
-            )
-        found.append((variance, row, lead, step))
-    return _together(found, rows)
-
-
-def _together(
-    found: list[tuple[Array, Array, Array, Array]], rows: Array
-) -> tuple[Array, Array, Array, Array]:
-    variances, leads, steps = (stacked([x[i] for x in found]) for i in (0, 2, 3))
-    runs = jnp.broadcast_shapes(variances.shape[1:], rows.shape[1:])
-    parts = [jnp.broadcast_to(x[1], (len(x[1]), *runs)) for x in found]
-    return variances, jnp.concatenate(parts), leads, steps
+            equation, scale = stage(_left, row, equation[1:], scale[1:], lead, batch=batch)
+            rests.append(equation)
+    lead, noise = stacked(leads), stacked(noises)
+    kept, steps = stage(_learnt, variances, finite, noise, lead, batch=batch)
+    if n == 1:
+        return kept, rows, lead, steps
+    rest = jnp.concatenate(rests)
+    return kept, stage(_corrected(n), rows, rest, steps, batch=batch), lead, steps
 
 
 @cache
-def _met(n: int) -> Callable[..., tuple[Array, ...]]:
-    """What happens to the variance of row k and to the noise of an equation with coefficient `lead`
-    there, and by how much of what is left of the equation the row changes.
+def _met(n: int) -> Callable[..., tuple[Array, Array]]:
+    """The coefficient of an equation at a row, 0 where it is only rounding, and the noise that what
+    is left of the equation has after it: r + lead^2 v, and infinite once a row that says nothing
+    has used it up."""
 
-    With variance v and noise r: v r / (r + lead^2 v), r + lead^2 v, and lead v / (r + lead^2 v); of
-    a row that says nothing r / lead^2, infinite (the equation is used up), and 1 / lead.
-    """
-
-    def met(variance: Array, noise: Array, lead: Array, scale: Array) -> tuple[Array, ...]:
-        unknown, telling = jnp.isinf(variance), ~jnp.isinf(noise)
-        v, r = jnp.where(unknown, 0, variance), jnp.where(telling, noise, 0)
+    def met(
+        variance: Array, finite: Array, noise: Array, lead: Array, scale: Array
+    ) -> tuple[Array, Array]:
         rounding = 8 * n * float(jnp.finfo(lead.dtype).eps) * scale
-        lead = jnp.where(unknown & (jnp.abs(lead) <= rounding), 0, lead)
         # What an exact equation says by rounding alone would be believed. Several have rounded it.
-        rounding = jnp.where(unknown, 0, 8 * rounding)
-        blind = (r <= rounding * (rounding * v)) & (jnp.abs(lead) <= rounding)
-        lead = jnp.where(blind, 0, lead)
-        again, both, step = _weighed(v, r, lead)
-        fresh = unknown & telling & (lead != 0)
-        inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
-        first = jnp.where(fresh, r * inverted * inverted, jnp.inf)
-        return (
-            jnp.where(unknown, first, jnp.where(telling, again, v)),
-            jnp.where(fresh | ~telling, jnp.inf, both),
-            lead,
-            jnp.where(unknown, inverted, jnp.where(telling, step, 0)),
-        )
+        bound = jnp.where(jnp.isinf(variance), 1, 8) * rounding
+        is_rounding = (jnp.abs(lead) <= bound) & (noise <= bound * (bound * variance))
+        lead = jnp.where(is_rounding, 0, lead)
+        used_up = jnp.isinf(variance) & (lead != 0)
+        return lead, jnp.where(used_up, jnp.inf, noise + lead * (lead * finite))
 
     return kept_apart(met)
 
 
 @kept_apart
-def _taken_out(
-    row: Array, rest: Array, scale: Array, lead: Array, step: Array
-) -> tuple[Array, Array, Array]:
+def _left(row: Array, rest: Array, scale: Array, lead: Array) -> tuple[Array, Array]:
     part = lead[None] * row
-    rest = rest - part
-    taken = row + step[None] * rest
-    # What an exact equation replaces leaves rounding, which the next one would take for its own.
-    rounding = 8 * (len(row) + 1) * float(jnp.finfo(row.dtype).eps) * jnp.abs(row)
-    left = lax.stop_gradient(jnp.where(jnp.abs(taken) < rounding, taken, 0))
-    return taken - left, rest, jnp.maximum(scale, jnp.abs(part))
+    return rest - part, jnp.maximum(scale, jnp.abs(part))
+
+
+@kept_apart
+def _learnt(variances: Array, finite: Array, noise: Array, lead: Array) -> tuple[Array, Array]:
+    """Variances (n,), and by how much of what is left of the equation each row changes.
+
+    With variance v and noise r: v r / (r + lead^2 v) and lead v / (r + lead^2 v); of a row that
+    says nothing r / lead^2 and 1 / lead.
+    """
+    unknown, telling = jnp.isinf(variances), ~jnp.isinf(noise)
+    r = jnp.where(telling, noise, 0)
+    S = r + lead * (lead * finite)
+    some = S > 0
+    q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
+    again = finite * jnp.where(some, r * q, 1)
+    fresh = unknown & telling & (lead != 0)
+    inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
+    first = jnp.where(fresh, r * inverted * inverted, jnp.inf)
+    return (
+        jnp.where(unknown, first, jnp.where(telling, again, finite)),
+        jnp.where(unknown, inverted, jnp.where(telling, lead * (finite * q), 0)),
+    )
+
+
+@cache
+def _corrected(n: int) -> Callable[[Array, Array, Array], Array]:
+    i, _ = np.triu_indices(n, 1)
+
+    def corrected(rows: Array, rest: Array, steps: Array) -> Array:
+        changed = rows + steps[i] * rest
+        # What an exact equation replaces leaves rounding, which the next would take for its own.
+        rounding = (8 * float(jnp.finfo(rows.dtype).eps) * (n - i)).astype(rows.dtype)
+        bound = rounding.reshape(-1, *[1] * (rows.ndim - 1)) * jnp.abs(rows)
+        left = lax.stop_gradient(jnp.where(jnp.abs(changed) < bound, changed, 0))
+        return changed - left
+
+    return kept_apart(corrected)
 
 
 @kernel
-def _answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
-    left, new = residual, []
-    for k in range(targets.shape[0]):
-        left = left - leads[k] * targets[k]
-        new.append(targets[k] + steps[k] * left)
-    return stacked(new)
+def _answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
+    for residual, lead, step in zip(residuals, leads, steps, strict=True):
+        said, left = lead * targets, [residual]
+        for part in said:
+            left.append(left[-1] - part)
+        targets = targets + step * stacked(left[1:])
+    return targets
 
 
 @kernel

@@ -88,7 +88,8 @@ def _covariance(r: Parameter, m: int) -> Callable[..., Array]:
             checks.shape("r", value, (m, m))
             return domain.covariance("r", value)
         value = domain.floating(domain.variance("r", value, params))
-        return value * (jnp if isinstance(value, Array) else np).eye(m, dtype=value.dtype)
+        # NumPy's eye: JAX's is a program, compiled where something known is asked inside a trace.
+        return value * np.eye(m, dtype=value.dtype)
 
     return cov
 

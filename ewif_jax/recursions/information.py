@@ -162,14 +162,10 @@ def gathered(
     """The state with further equations (k, n), their variances (k,) and targets (k,), around the
     same reference; `sizes` (k, n) as in `equations.absorbed`."""
 
-    def add(known_before: tuple[Array, ...], new: tuple[Any, ...]) -> tuple[Any, None]:
-        equation, variance, target, size = new
-        kept, rows, answers = known_before
-        kept, rows, leads, steps = equations.absorbed(kept, rows, equation, variance, size)
-        return (kept, rows, equations.answered(answers, target, leads, steps)), None
-
-    before = state.variances, state.rows, state.targets
-    (kept, rows, answers), _ = lax.scan(add, before, (told, variances, targets, sizes))
+    kept, rows, leads, steps = equations.absorbed(
+        state.variances, state.rows, told, variances, sizes
+    )
+    answers = equations.answered(state.targets, targets, leads, steps)
     return state._replace(variances=kept, rows=rows, targets=answers)
 
 
@@ -217,14 +213,8 @@ def absorb(
     told, apart = cholesky.forward(noise.unit, usable), cholesky.forward(noise.unit, residual)
     sizes = None if size is None else summed(noise.unit, jnp.where(good, size, 0))
     spreads = jnp.where(used & mask, noise.variances * growth, jnp.inf)
-    variances, rows, targets = state.variances, state.rows, state.targets
-    for k in range(mask.shape[0]):  # apart from the targets it depends on no data: runs share it
-        own = None if sizes is None else sizes[k]
-        variances, rows, leads, steps = equations.absorbed(
-            variances, rows, told[k], spreads[k], own
-        )
-        targets = equations.answered(targets, apart[k], leads, steps)
-    updated = state._replace(variances=variances, rows=rows, targets=targets)
+    # Apart from the targets it depends on no data: runs share it.
+    updated = gathered(state, told, spreads, apart, sizes)
     info = _info(state, usable, residual, R * growth, measurement, good, exact)
     # Variances outside of their domain are NaN here, and nothing is known from then on.
     is_broken = jnp.any(jnp.isnan(gaussian.mask_cov(R, mask)))
