@@ -70,12 +70,7 @@ def covariance(inverse_rows: Array, variances: Array) -> Array:
 
 def of_covariance(cov: Array) -> tuple[Array, Array]:
     """Variances and rows of a covariance (n, n), with the floor of `orthogonal.spread`."""
-    # In reverse order the lower factor is an upper one: P = U U', and U^-1 holds the equations.
-    found = cholesky.factor(cov[::-1, ::-1])
-    unit = (found.lower * found.reciprocal[None])[::-1, ::-1]
-    variances = jnp.square(jnp.diagonal(found.lower)[::-1])
-    floors = least_share(len(cov), cov.dtype) * jnp.diagonal(cov)
-    return jnp.maximum(variances, floors), strict(inverse(strict(unit)))
+    return _of_covariance(cov)
 
 
 def carried(rows: Array, back: Array, where: Pattern) -> tuple[Array, Array]:
@@ -293,6 +288,28 @@ def _inverse(rows: Array) -> Array:
 def _less(row: Array, *below: Array) -> Array:
     first = below[0].shape[0] - len(below)
     return -total(r[None] * b[first:] for r, b in zip(row, below, strict=True))
+
+
+@kernel
+def _of_covariance(cov: Array) -> tuple[Array, Array]:
+    # Rows of P and of the identity together: what makes P lower triangular, from its last row up,
+    # makes the identity T with T P T' = diag(variances). A loop, since it happens once.
+    n, runs = cov.shape[0], [1] * (cov.ndim - 2)
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=cov.dtype).reshape(n, n, *runs), cov.shape)
+    diagonal = jnp.stack([cov[k, k] for k in range(n)])
+
+    def eliminate(both: Array, k: Array) -> tuple[Array, Array]:
+        column = lax.dynamic_index_in_dim(both, k, 1, keepdims=False)
+        pivot, was = (lax.dynamic_index_in_dim(x, k, keepdims=False) for x in (column, diagonal))
+        kept = pivot > cholesky.negligible(n, cov.dtype) * was
+        above = (jnp.arange(n) < k).reshape(n, *runs)
+        shares = jnp.where(above & kept[None], column / jnp.where(kept, pivot, 1)[None], 0)
+        row = lax.dynamic_index_in_dim(both, k)
+        return both - shares[:, None] * row, jnp.where(kept, pivot, 0)
+
+    both, pivots = lax.scan(eliminate, jnp.concatenate([cov, eye], 1), jnp.arange(n), reverse=True)
+    i, j = np.triu_indices(n, 1)
+    return jnp.maximum(pivots, least_share(n, cov.dtype) * diagonal), both[i, n + j]
 
 
 @kernel

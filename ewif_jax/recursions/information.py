@@ -9,10 +9,10 @@ far from the origin that is more than what one measurement changes.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
@@ -161,7 +161,6 @@ def gathered(
 ) -> InformationState:
     """The state with further equations (k, n), their variances (k,) and targets (k,), around the
     same reference; `sizes` (k, n) as in `equations.absorbed`."""
-
     kept, rows, leads, steps = equations.absorbed(
         state.variances, state.rows, told, variances, sizes
     )
