@@ -154,9 +154,8 @@ def _absorbed(
         kept, changed, leads, steps = _one_absorbed(*known, *new, batch)
         return (kept, changed), (leads, steps)
 
-    kept, told = lax.scan(
-        add, (widened(variances), widened(rows)), tuple(widened(x) for x in given[2:])
-    )
+    new = widened(equations), widened(noises), widened(sizes)
+    kept, told = lax.scan(add, (widened(variances), widened(rows)), new)
     return *kept, *told
 
 
