@@ -17,7 +17,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.kernels import cholesky, equations, gaussian, remainders, symmetric
+from ewif_jax.kernels import absorbing, cholesky, equations, gaussian, remainders, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.orthogonal import spread
 from ewif_jax.kernels.trees import choose
@@ -160,11 +160,11 @@ def gathered(
     sizes: Array | None = None,
 ) -> InformationState:
     """The state with further equations (k, n), their variances (k,) and targets (k,), around the
-    same reference; `sizes` (k, n) as in `equations.absorbed`."""
-    kept, rows, leads, steps = equations.absorbed(
+    same reference; `sizes` (k, n) as in `absorbing.absorbed`."""
+    kept, rows, leads, steps = absorbing.absorbed(
         state.variances, state.rows, told, variances, sizes
     )
-    answers = equations.answered(state.targets, targets, leads, steps)
+    answers = absorbing.answered(state.targets, targets, leads, steps)
     return state._replace(variances=kept, rows=rows, targets=answers)
 
 

@@ -1,0 +1,156 @@
+"""Further equations, added to what is known of a state (`kernels.equations`) one by one."""
+
+from collections.abc import Callable
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ewif_jax.fast.batched import kept_apart, kernel, stacked, stage
+from ewif_jax.kernels.equations import by_equation
+
+
+def absorbed(
+    variances: Array, rows: Array, equations: Array, noises: Array, sizes: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Variances and rows with further `equations` (m, n), whose errors have variances `noises`
+    (m,). `sizes` (m, n) of the terms that their coefficients were summed from, where they may
+    cancel.
+
+    Also leads and steps (m, n): what `answered` needs to do the same to the targets, which are the
+    only part that depends on data. A direction about which nothing is known is learnt from an
+    equation only where that is more than the rounding of taking out what is known.
+    """
+    sizes = jnp.abs(equations) if sizes is None else sizes
+    return _absorbed(variances, rows, equations, noises, sizes)
+
+
+def answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
+    """The targets with further equations, which say `residuals` (m,)."""
+    return _answered(targets, residuals, leads, steps)
+
+
+@kernel
+def _absorbed(
+    variances: Array, rows: Array, equations: Array, noises: Array, sizes: Array
+) -> tuple[Array, Array, Array, Array]:
+    batch = noises.ndim - 1
+    if len(noises) == 1:
+        one = _one_absorbed(variances, rows, equations[0], noises[0], sizes[0], batch)
+        return one[0], one[1], one[2][None], one[3][None]
+    # A loop, although it has a few rounds only: written out, each would be compiled by itself.
+    given = variances, rows, equations, noises, sizes
+    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in given))
+
+    def widened(x: Array) -> Array:
+        return jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs)
+
+    def add(
+        known: tuple[Array, Array], new: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        kept, changed, leads, steps = _one_absorbed(*before, *new, batch)
+        return (kept, changed), (leads, steps)
+
+    new = widened(equations), widened(noises), widened(sizes)
+    kept, told = lax.scan(add, (widened(variances), widened(rows)), new)
+    return *kept, *told
+
+
+def _one_absorbed(
+    variances: Array, rows: Array, equation: Array, noise: Array, scale: Array, batch: int
+) -> tuple[Array, Array, Array, Array]:
+    # What is left of the equation for each row has to be found one row after the other, and is all
+    # that is: what it does to variances and rows is computed for all rows at once.
+    n = equation.shape[0]
+    unknown = jnp.isinf(variances)
+    finite = jnp.where(unknown, 0, variances)
+    leads, noises, rests = [], [], []
+    for k, row in enumerate(by_equation(rows, n)):
+        noises.append(noise)
+        lead, noise = stage(
+            _met(n), variances[k], finite[k], noise, equation[0], scale[0], batch=batch
+        )
+        leads.append(lead)
+        if k < n - 1:
+            equation, scale = stage(_left, row, equation[1:], scale[1:], lead, batch=batch)
+            rests.append(equation)
+    lead, noise = stacked(leads), stacked(noises)
+    kept, steps = stage(_learnt, variances, finite, noise, lead, batch=batch)
+    if n == 1:
+        return kept, rows, lead, steps
+    rest = jnp.concatenate(rests)
+    return kept, stage(_corrected(n), rows, rest, steps, batch=batch), lead, steps
+
+
+@cache
+def _met(n: int) -> Callable[..., tuple[Array, Array]]:
+    """The coefficient of an equation at a row, 0 where it is only rounding, and the noise that what
+    is left of the equation has after it: r + lead^2 v, and infinite once a row that says nothing
+    has used it up."""
+
+    def met(
+        variance: Array, finite: Array, noise: Array, lead: Array, scale: Array
+    ) -> tuple[Array, Array]:
+        rounding = 8 * n * float(jnp.finfo(lead.dtype).eps) * scale
+        # What an exact equation says by rounding alone would be believed. Several have rounded it.
+        bound = jnp.where(jnp.isinf(variance), 1, 8) * rounding
+        is_rounding = (jnp.abs(lead) <= bound) & (noise <= bound * (bound * variance))
+        lead = jnp.where(is_rounding, 0, lead)
+        used_up = jnp.isinf(variance) & (lead != 0)
+        return lead, jnp.where(used_up, jnp.inf, noise + lead * (lead * finite))
+
+    return kept_apart(met)
+
+
+@kept_apart
+def _left(row: Array, rest: Array, scale: Array, lead: Array) -> tuple[Array, Array]:
+    part = lead[None] * row
+    return rest - part, jnp.maximum(scale, jnp.abs(part))
+
+
+@kept_apart
+def _learnt(variances: Array, finite: Array, noise: Array, lead: Array) -> tuple[Array, Array]:
+    """Variances (n,), and by how much of what is left of the equation each row changes.
+
+    With variance v and noise r: v r / (r + lead^2 v) and lead v / (r + lead^2 v); of a row that
+    says nothing r / lead^2 and 1 / lead.
+    """
+    unknown, telling = jnp.isinf(variances), ~jnp.isinf(noise)
+    r = jnp.where(telling, noise, 0)
+    S = r + lead * (lead * finite)
+    some = S > 0
+    q = jnp.where(some, 1 / jnp.where(some, S, 1), 0)
+    again = finite * jnp.where(some, r * q, 1)
+    fresh = unknown & telling & (lead != 0)
+    inverted = jnp.where(fresh, 1 / jnp.where(fresh, lead, 1), 0)
+    first = jnp.where(fresh, r * inverted * inverted, jnp.inf)
+    return (
+        jnp.where(unknown, first, jnp.where(telling, again, finite)),
+        jnp.where(unknown, inverted, jnp.where(telling, lead * (finite * q), 0)),
+    )
+
+
+@cache
+def _corrected(n: int) -> Callable[[Array, Array, Array], Array]:
+    i, _ = np.triu_indices(n, 1)
+
+    def corrected(rows: Array, rest: Array, steps: Array) -> Array:
+        changed = rows + steps[i] * rest
+        # What an exact equation replaces leaves rounding, which the next would take for its own.
+        rounding = (8 * float(jnp.finfo(rows.dtype).eps) * (n - i)).astype(rows.dtype)
+        bound = rounding.reshape(-1, *[1] * (rows.ndim - 1)) * jnp.abs(rows)
+        left = lax.stop_gradient(jnp.where(jnp.abs(changed) < bound, changed, 0))
+        return changed - left
+
+    return kept_apart(corrected)
+
+
+@kernel
+def _answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
+    for residual, lead, step in zip(residuals, leads, steps, strict=True):
+        said, left = lead * targets, [residual]
+        for part in said:
+            left.append(left[-1] - part)
+        targets = targets + step * stacked(left[1:])
+    return targets
