@@ -47,7 +47,7 @@ def _absorbed(
         return jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs)
 
     def add(
-        known: tuple[Array, Array], new: tuple[Array, Array, Array]
+        before: tuple[Array, Array], new: tuple[Array, Array, Array]
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         kept, changed, leads, steps = _one_absorbed(*before, *new, batch)
         return (kept, changed), (leads, steps)
