@@ -172,6 +172,8 @@ def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
 def _batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, batch: int) -> Any:
     runs = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     args = [
+        # What all runs share keeps an axis of 1 and is not repeated: a kernel whose inputs are all
+        # shared then gives an axis of 1, which says below that its result is shared too.
         x[..., None] if d is None else jnp.moveaxis(x, d, -1)
         for x, d in zip(args, dims, strict=True)
     ]
@@ -181,6 +183,9 @@ def _batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, b
     return out, [None if s else x.ndim - 1 for x, s in zip(out, shared, strict=True)]
 
 
+# The equation that goes into a derivative is again a kernel, so it is batched and kept apart like
+# the first, and derivatives of any order come by the same three rules. Only tangents that move are
+# arguments: a zero tangent would be computed with.
 def _jvp(primals: Sequence[Array], tangents: Sequence[Any], *, fn: Function, batch: int) -> Any:
     out = _kernel_p.bind(*primals, fn=fn, batch=batch)
     live = tuple(not isinstance(t, ad.Zero) for t in tangents)
@@ -197,6 +202,8 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
     def tangent(*args: Array) -> tuple[Array, ...]:
         primals, moved = args[: len(live)], args[len(live) :]
         at = [x for x, moves in zip(primals, live, strict=True) if moves]
+        # A shared primal (axis of 1) may have a tangent of each run, and the other way round;
+        # `jax.jvp` asks for the same shape of both.
         shapes = [jnp.broadcast_shapes(x.shape, t.shape) for x, t in zip(at, moved, strict=True)]
         at, moved = (
             [jnp.broadcast_to(x, s) for x, s in zip(xs, shapes, strict=True)] for xs in (at, moved)
@@ -210,6 +217,9 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
     return kept_apart(tangent) if fn in _APART else tangent
 
 
+# A kernel is transposed only in arguments in which it is linear (the tangents of `_jvp`). The
+# transpose depends on which these are and on their shapes without runs, so it is a function of
+# both, made once.
 def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) -> Sequence[Any]:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     unknown = [x.aval for x in args if ad.is_undefined_primal(x)]
@@ -244,6 +254,8 @@ def _adjoint(
             every = _merge(is_fixed, fixed, _merge(linear, xs, linear))
             return tuple(_inline(*every, fn=fn, batch=0))
 
+        # Cotangents of what all runs share arrive with an axis of 1; `linear_transpose` wants the
+        # shape of the output. What is repeated here is summed again in `_summed`.
         given = tuple(
             jnp.broadcast_to(x, x.shape[:r] + runs)
             for x, r in zip(given, ranks[count:], strict=True)
@@ -265,6 +277,8 @@ def _summed(x: Array, shape: tuple[int, ...]) -> Array:
     return jnp.sum(x, axes, keepdims=True) if axes else x
 
 
+# Only CPUs keep kernels apart: there a fused chain is computed again for every element that reads
+# it. Elsewhere a kernel is a part of the program like any other.
 _kernel_p = Primitive("kernel")
 _kernel_p.multiple_results = True
 _kernel_p.def_impl(lambda *args, fn, batch: _jitted(fn)(*args))

@@ -58,6 +58,9 @@ def scan_in_blocks(
             arrival = jax.tree.map(like, arrival, whole)
         return step(state, arrival)
 
+    # Reverse mode then keeps the states between blocks and computes the steps of a block again,
+    # instead of keeping all steps. Inside a scan nothing can merge the two computations, so the
+    # barrier against that, which costs copies, is left out.
     @partial(jax.checkpoint, prevent_cse=False)
     def several(state: State, numbered: PyTree) -> tuple[Any, Any]:
         state, seen = lax.scan(numbered_step, state, numbered)
@@ -128,6 +131,8 @@ def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Slopes are added, not put. The transpose of adding leaves the whole as it is; that of putting
     clears it in the place, for which the compiler copies the whole, each time."""
     whole, new, at, already_there = primals
+    # Groups overlap: rows that the group before has put there would otherwise add their slope
+    # twice.
     fresh = jnp.arange(len(new))[:, None] >= already_there
     numbers = lax.ScatterDimensionNumbers((0, 1), (), (0, 1))
     slope = lax.scatter_add(

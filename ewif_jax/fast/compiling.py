@@ -61,6 +61,7 @@ def prepare_cpu(devices: int | None = None) -> None:
     count = _cores() if devices is None else checks.whole("devices", devices, 1)
     flags = os.environ.get("XLA_FLAGS", "")
     chosen = _OPTIONS in flags
+    # What an application has set itself stays as it is.
     if chosen and jax.config.values.get("jax_num_cpu_devices") == count:
         return  # a notebook's first cell may run again
     jax.config.update("jax_num_cpu_devices", count)
@@ -130,6 +131,8 @@ def one_program(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 def transformed() -> bool:
     """Whether what is called here becomes a part of another program."""
+    # The state outside of any transformation is taken once, when the module loads, and under
+    # compile-time evaluation: the import itself may happen inside of somebody's trace.
     return get_opaque_trace_state() != _OUTSIDE
 
 
@@ -141,6 +144,8 @@ with jax.ensure_compile_time_eval():
 def _known() -> frozenset[str]:
     """The names of the options that this XLA knows: later ones have dropped some."""
     options = {**QUICKEST, **WIDE} if jax.default_backend() == "cpu" else {}
+    # XLA refuses unknown options by name and one at a time, and has no list to ask: so a trivial
+    # program is compiled with fewer and fewer of them.
     while options:
         try:
             jax.jit(lambda: 0, compiler_options=options)()

@@ -59,6 +59,8 @@ def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
     def computing(outputs: list[Any], at: tuple[int, int]) -> tuple[list[Any], set[Any]]:
         """The equations of these levels behind `outputs`, and all that they read."""
         read, kept = {v for v in outputs if not isinstance(v, Literal)}, []
+        # Backwards, so that an equation is kept only if something kept after it reads it: dead code
+        # goes.
         for eqn in reversed(jaxpr.eqns):
             if (eqn.effects or read.intersection(eqn.outvars)) and _level(eqn, level) in at:
                 kept.append(eqn)
@@ -72,6 +74,8 @@ def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
     def inputs_but(number: int) -> list[Any]:
         return [v for v, n in zip(jaxpr.invars, numbers, strict=True) if n != number]
 
+    # Level 0 (parameters that all share) is in both parts: to compute it again costs less than to
+    # store it for every arrival. Level 1 is stored where the rest reads it; level 2 is of each run.
     equations, read = computing(late, (0, 2))
     made = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     needed = [v for v in (*jaxpr.invars, *made) if v in read and level(v) == 1]

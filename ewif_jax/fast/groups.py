@@ -106,6 +106,8 @@ def group_size(
     room = max(
         min(SIZES.second_cache // max(own + shared, 1), SIZES.undivided // max(largest, 1)), 1
     )
+    # Narrow groups pay only where a step is not a call of XLA for each operation: those cost the
+    # same for any width, and would be as many more as there are groups.
     if own > shared and loops_are_joined():
         # A short step computes about as much again, three times.
         fits = SIZES.first_cache // (4 * own if together else own)
@@ -114,6 +116,9 @@ def group_size(
     if room < (SIZES.fewest_drawn if draws else min(runs, SIZES.fewest)):
         return 1
     fewest = -(-runs // room)
+    # Up to twice the fewest groups are tried: somewhat narrower ones may overlap less and have an
+    # odd number of lines (docs/decisions/fast.md and `README.md`: "A group is an odd number of
+    # cache lines wide").
     sizes = [_odd_lines(-(-runs // groups), itemsize) for groups in range(fewest, 2 * fewest + 2)]
     candidates = [size for size in sizes if min(room, 64) <= size <= min(room, runs)]
     candidates += [runs] * (runs <= room)
@@ -178,6 +183,8 @@ def in_groups(
     if size == runs:
         return fn(merged(flagged, 0), None)
     groups = -(-runs // size)
+    # The last group begins earlier, so that all are equally wide: one program for all of them. Runs
+    # that two groups share come out twice with the same numbers.
     begins = np.minimum(np.arange(groups) * size, runs - size)
 
     def grouped(x: Array) -> Array:
@@ -191,6 +198,8 @@ def in_groups(
         return fn(merged(group, begin), Place(whole, begin, known))
 
     split = [grouped(x) for x in flagged]
+    # The whole result is made once, before the loop, and each group writes its rows into it:
+    # stacked by the scan and concatenated after it, the result would be copied.
     shapes = jax.eval_shape(lambda group: fn(merged(group, 0), None)[0], [x[0] for x in split])
     shapes = jax.tree.map(lambda x: x.update(shape=(runs, *x.shape[1:])), shapes)
     whole, last = lax.scan(

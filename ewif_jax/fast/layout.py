@@ -57,6 +57,7 @@ def runs_last(tree: PyTree, flags: PyTree) -> Any:
         if not flag or jnp.ndim(x) == 1:
             return x
         x = jnp.asarray(x)
+        # One transpose of a matrix (runs, numbers), as a pass of its own (see `turned`).
         return turned(x.reshape(x.shape[0], -1)).reshape(*x.shape[1:], -1)
 
     return jax.tree.map(trailing, tree, flags)

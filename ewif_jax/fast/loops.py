@@ -115,6 +115,8 @@ def _portion_of(run: OneRun, shown: PyTree, per_run: Inputs, value: Array, ahead
     """How many runs and steps at a time, for an estimate of such a size."""
     runs, steps, _ = value.shape
     own, shared, largest = _sizes(run.start.outputs, run.state_differs, shown)
+    # Whether a filter draws is read off its equations: only the key is taken as different by run,
+    # and what then differs in the first state holds random members.
     of_key = dependence(
         run.start,
         per_run._replace(params=_alike(per_run.params), prior=_alike(per_run.prior)).first,
@@ -132,6 +134,8 @@ def _that_differ(
     step: Traced, params_f: PyTree, state_f: PyTree, arrival_f: PyTree
 ) -> tuple[Any, Any]:
     """Which leaves of the state, and of what is observed, differ by run (pytrees of bools)."""
+    # A fixed point: a leaf of the state that differs after a step makes others differ in the next.
+    # Flags only ever turn True, so it ends after at most as many rounds as there are leaves.
     while True:
         later_f, seen_f = dependence(step, (params_f, state_f, arrival_f))
         either = jax.tree.map(lambda a, b: a or b, state_f, later_f)
@@ -179,6 +183,8 @@ def _shared_ahead(
 
     state = parted(loop.start(*one_run(inputs.first, per_run.first)), state_differs)[1]
     arrivals = parted(inputs.arrivals, per_run.arrivals)[1]
+    # This loop runs once for the whole batch; for `kalman` with common times it holds the
+    # covariances and gains, and what is left for the groups is the means.
     last, (seen, needed) = lax.scan(step_ahead, state, arrivals, steps)
 
     def start(params: Params, prior: PyTree, key: RandomKey) -> Any:
@@ -235,6 +241,8 @@ def _scanned(
     flags = per_run.params, state_differs, per_run.arrivals
     step = vmap_last(loop.step, flags, (state_differs, seen_differs), runs)
 
+    # The layout is asked for on both sides of a step: XLA may choose another one for the carry of a
+    # loop and turn the state around at each step.
     def arrive(state: State, arrival: Numbers) -> tuple[Any, Any]:
         state, seen = step(inputs.params, runs_adjacent(state, state_differs), arrival)
         return runs_adjacent(state, state_differs), seen

@@ -94,6 +94,8 @@ def once(check: Callable[Given, Answer]) -> Callable[Given, Answer]:
         if not arrays or len(leaves) > MOST_LEAVES or not all(map(_is_fixed, leaves)):
             return check(*args, **kwargs)
         try:
+            # Arrays of JAX cannot change, so their address says which they are as long as they
+            # live; to read them would wait for the device and cost more than many a check.
             told = [id(x) if isinstance(x, Array) else (content_key(x),) for x in leaves]
         except NotConcreteError:
             return check(*args, **kwargs)

@@ -72,6 +72,8 @@ def _sloped(fn: Callable[..., Any], per_run: Sequence[bool]) -> Callable[..., An
         start, moved = ([xs[k] for k in active] for xs in (primals, tangents))
         each = [per_run[k] for k in active]
         widths = [x.size // (len(x) if own else 1) for x, own in zip(start, each, strict=True)]
+        # Symbolic zeros tell which inputs move at all. With many numbers the columns would cost
+        # more than they save, and plain `jvp` lets JAX choose the mode as ever.
         if not 0 < sum(widths) <= FEW:
             return jax.jvp(of_active, (start,), (moved,))
         return _in_columns(of_active, start, moved, each, widths)
@@ -106,6 +108,10 @@ def _in_columns(
         The second derivative is not used, so the compiler leaves it out.
         """
         first, second = map(direction, columns)
+        # Two slopes in one pass: the derivative in direction v of the pair (f, its slope along u)
+        # is the pair (slope along v, mixed second derivative). So f itself is computed once for
+        # both, and the mixed derivative, which nobody reads, is dropped by the compiler
+        # (docs/decisions/fast.md).
         (out, one), (other, _) = jax.jvp(lambda x: jax.jvp(fn, (x,), (first,)), (start,), (second,))
         return out, jax.tree.map(lambda *both: _stacked(both), one, other)
 
@@ -115,6 +121,8 @@ def _in_columns(
     elif count == 2:
         out, columns = pair(jnp.eye(2))
     else:
+        # Three or four directions go in turns of two. An odd number is filled up with a direction
+        # of zeros, whose column is cut off again: one program for both turns.
         turns = jnp.eye(count + count % 2, count).reshape(-1, 2, count)
         outs, found = lax.map(pair, turns)
         out = jax.tree.map(lambda x: x[0], outs)
@@ -123,6 +131,9 @@ def _in_columns(
         (x.reshape(len(x), -1).T if own else x.reshape(-1))
         for x, own in zip(moved, per_run, strict=True)
     ]
+    # The true tangent enters only here, linearly: this sum is what reverse mode transposes, so the
+    # loop above is never run backwards. In a batch a parameter of each run moves only its own run,
+    # so that one column serves all runs (the Jacobian is block diagonal).
     taken = [step for x in steps for step in x]
     return out, jax.tree.map(lambda x, column: _along(x, column, taken), out, columns)
 

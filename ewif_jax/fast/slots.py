@@ -27,6 +27,8 @@ def _pushed(new: Array, table: Array, push: Array) -> Array:
 
 @kernel
 def _picked(table: Array, here: Array) -> Array:
+    # A sum over one-hot terms instead of an index: with a batch an index becomes a gather, run by
+    # run. `where` and not a product: entries that are not chosen may be infinite.
     if here.ndim == 1:
         return jnp.sum(jnp.where(here.reshape(-1, *(1,) * (table.ndim - 1)), table, 0), 0)
     return total(

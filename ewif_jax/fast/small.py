@@ -38,6 +38,8 @@ def _sparse(where: Pattern) -> Callable[[Array, Array], Array]:
 
 
 def _dot(a: Array, b: Array) -> Array:
+    # Up to here one fused loop is faster than a call of a library (3 microseconds). Found by
+    # measuring (`README.md`: "A single matrix is computed whole").
     if a.size * b.shape[1] <= (256 if b.shape[1] > 16 else 4096):
         return multiplied(a, b)
     # A transposed factor would take a slower library.

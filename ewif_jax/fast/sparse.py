@@ -51,9 +51,12 @@ def full(rows: int, cols: int) -> Pattern:
 
 def elements(a: Array, rows: np.ndarray, cols: np.ndarray, counts: np.ndarray) -> Array:
     """a[rows, cols] of a matrix (n, k, ...) where it `counts`, else 0."""
+    # Flat indices, known before tracing: one gather along the leading axis, batch behind.
     picked = a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])[rows * a.shape[1] + cols]
     if counts.all():
         return picked
+    # Fillers are multiplied by 0, so that all rows have equally many terms and the sum has one
+    # shape; they point at an element of the same row, never out of the matrix.
     return picked * jnp.asarray(counts, a.dtype).reshape(counts.shape + (1,) * (a.ndim - 2))
 
 

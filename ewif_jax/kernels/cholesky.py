@@ -63,12 +63,14 @@ def solved(a: Array, b: Array) -> Array:
 
 def inverse(f: Factor) -> Array:
     """A^-1 (n, n), symmetric by construction."""
+    # L^-1 once, then its square: symmetric to the last bit, and half the work of two solves.
     root = forward(f, jnp.eye(f.lower.shape[0], dtype=f.lower.dtype))
     return root.T @ root
 
 
 def half_log_det(f: Factor) -> Array:
     """log det A / 2 over the pivots that are not zero."""
+    # From the reciprocals, which exist already: the pivots themselves would be divided out again.
     return -jnp.sum(jnp.log(jnp.where(f.reciprocal > 0, f.reciprocal, 1)))
 
 
@@ -104,6 +106,10 @@ def _column(tolerance: float) -> Callable[..., tuple[Array, Array]]:
 
     def column(rest: Array, diagonal: Array) -> tuple[Array, Array]:
         pivot = rest[0, 0]
+        # The pivot is compared with the terms it is the difference of: what is left of a diagonal
+        # element by cancellation is rounding below a few n eps of it (Higham, Accuracy and
+        # Stability, ch. 10). The inner `where` keeps the root of a skipped pivot out of the
+        # derivative: inf times 0 is NaN.
         kept = pivot > tolerance * diagonal
         reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, pivot, 1)), 0)
         return rest[:, 0] * reciprocal[None], reciprocal
@@ -139,6 +145,8 @@ _forward, _backward, _solve = map(kernel, (_forward_rows, _backward_rows, _solve
 
 def _apart(n: int, fn: Callable[..., Any], *args: Array, batch: int) -> Any:
     """`fn`, computed once where recomputing for an (n, n) matrix would add up."""
+    # Unrolled and fused, a step would be computed again for each later one that reads it. Up to 3
+    # rows that costs less than the calls.
     return stage(fn, *args, batch=batch) if n > 3 else fn(*args)
 
 

@@ -66,7 +66,11 @@ def mean_length(mean: Array, cov: Array) -> Array:
         exponent = cholesky.half_log_det(factor) + t * jnp.sum(jnp.square(white))
         # The logarithm of 1 + t loses the digits of a small t.
         few = jnp.minimum(t, small)  # the square of a large t is infinite in float32
+        # log |1 + 2 t C| / 2 + t m'(1 + 2 t C)^-1 m to second order in t: t (tr C + m'm), which is
+        # t in these units, minus t^2 `second`. The neglected third order is below eps where t <
+        # eps^(1/3).
         exponent = jnp.where(t < small, few - jnp.square(few) * second, exponent)
+        # t^(-3/2) dt = t^(-1/2) d(log t): hence half a power of t less than in the integral.
         return -jnp.expm1(-exponent) * jnp.exp(-log / 2)
 
     total = jnp.sum(jnp.asarray(WEIGHTS, mean.dtype) * jax.vmap(missing)(nodes))

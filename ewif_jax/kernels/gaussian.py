@@ -86,6 +86,8 @@ def update(
     innovation = Innovation(jnp.where(mask, difference, 0), cov, factor, cross)
     weights = cholesky.solve(innovation.factor, cross)
     mean = _moved(mean, weights, innovation.value)
+    # P - P H' K' first, then + K (R K' - H half): the same as Joseph's product, but two low-rank
+    # steps on the triangle in place of two n x n products.
     half = _less(packed, cross, weights)
     left_over = _left_over(R, weights, symmetric.rows(H, half, H_where))
     least = _least(mean.shape[0])(R, cov)

@@ -13,6 +13,7 @@ SHORT = 0.5
 def largest_variance(dtype: DTypeLike) -> float:
     """How large a variance may become. The derivative of an update divides by squares of variances:
     they and their reciprocals have to be ordinary numbers."""
+    # 0.4 and not 0.5: a square (0.8) times a few numbers of ordinary size still has to fit.
     return float(jnp.finfo(dtype).max) ** 0.4
 
 
@@ -24,8 +25,10 @@ def grown(variances: Array, growth: Array | float) -> Array:
     """
     growth = jnp.asarray(growth, variances.dtype)
     ceiling = largest_variance(variances.dtype)
+    # Asked before multiplying: the product might overflow, and its derivative would be inf times 0.
     fits = variances <= ceiling / growth
     larger = jnp.where(fits, variances, 0) * jnp.where(fits, growth, 1)
+    # Saturated values have no derivative: growing further changes nothing.
     larger = jnp.where(fits, larger, jnp.maximum(lax.stop_gradient(variances), ceiling))
     return jnp.where(jnp.isfinite(growth) & ~jnp.isinf(variances), larger, growth + variances)
 

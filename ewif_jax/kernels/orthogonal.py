@@ -33,6 +33,8 @@ def _spread_certain(vectors: Array, variances: Array) -> tuple[Array, Array]:
 def _orthogonal(vectors: Array, variances: Array, project: Callable[..., Any]) -> Any:
     n, batch = vectors.shape[0], variances.ndim - 1
     floors = least_share(n, vectors.dtype) * jnp.sum(vectors * vectors * variances[None], 1)
+    # From the last component to the first, because the equations are unit upper triangular: row k
+    # holds only components after it. Thornton (1976), weighted by the variances.
     rest, columns, kept = vectors, [], []
     for j in reversed(range(n)):
         rest, column, variance = stage(project, rest, variances, floors[j], batch=batch)

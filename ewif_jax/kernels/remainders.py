@@ -15,7 +15,12 @@ def moved(F: Array, c: Array | None, mean: Array, where: Pattern | None) -> tupl
     """
     if where is not None:
         where = tuple((*row[:k], True, *row[k + 1 :]) for k, row in enumerate(where))
+    # F - I keeps the digits of a short interval: F mean would add a small change to a large mean
+    # and round it away. The identity's places are added to the pattern, since F_kk - 1 may differ
+    # from 0 where F_kk does.
     change = matvec(F - jnp.eye(mean.shape[0], dtype=F.dtype), mean, where)
     change = change if c is None else change + c
     there = mean + change
+    # The two-sum of Kahan and Knuth: there - mean is exact where the change is smaller than the
+    # mean, so this is what the addition has lost.
     return there, change - (there - mean)

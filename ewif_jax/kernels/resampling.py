@@ -25,8 +25,12 @@ def ancestors(key: Array, log_weights: Array, method: Resampling) -> Array:
     its share, and a running maximum fills the slots between.
     """
     N = log_weights.shape[0]
+    # Which particle is copied is a choice of whole numbers: it has no derivative, and one through
+    # the weights would be wrong.
     w = lax.stop_gradient(jnp.exp(log_weights - jnp.max(log_weights)))
     up_to = jnp.cumsum(w)
+    # The begin of each share in units of slots. The sum itself normalises, so that rounding cannot
+    # leave a last slot without a particle.
     share = (up_to - w) * (N / up_to[-1])
     slot = jnp.clip(share, 0, N).astype(jnp.int32)
     if method == "systematic":
@@ -35,5 +39,7 @@ def ancestors(key: Array, log_weights: Array, method: Resampling) -> Array:
         u = jax.random.uniform(key, (N,), w.dtype)[jnp.minimum(slot, N - 1)]
     beyond = (u < share - slot.astype(w.dtype)).astype(jnp.int32)
     first = jnp.where(w > 0, slot + beyond, N)
+    # Several small particles may begin in one slot; the last of them has it, as a search would
+    # find. What begins beyond the last slot is dropped: no copy.
     marks = jnp.zeros(N, jnp.int32).at[first].max(jnp.arange(N, dtype=jnp.int32), mode="drop")
     return lax.cummax(marks)

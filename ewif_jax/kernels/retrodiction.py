@@ -15,5 +15,7 @@ def bridge(Q_before: Array, F_after: Array, Q_after: Array) -> tuple[Array, Arra
     """
     cross = matmul(F_after, Q_before)
     f = cholesky.factor(matmul(cross, F_after.T) + Q_after)
+    # With root = L^-1 F2 Q1 both results come from one triangular solve: G' = L'^-1 root, and G F2
+    # Q1 = root' root, symmetric by construction.
     root = cholesky.forward(f, cross)
     return cholesky.backward(f, root).T, Q_before - matmul(root.T, root)

@@ -52,6 +52,8 @@ def _gather(full: Array) -> Array:
     n = full.shape[0]
     rows, cols = np.triu_indices(n)
     flat = full.reshape(n * n, *full.shape[2:])
+    # The adjoint of filling both triangles: an element off the diagonal is written to two places,
+    # so its slope is the sum of both.
     twice = jnp.asarray(rows != cols, full.dtype).reshape(-1, *(1,) * (full.ndim - 2))
     return flat[rows * n + cols] + twice * flat[cols * n + rows]
 
@@ -79,10 +81,10 @@ def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
 
 
 def propagated(
-    a: Array, packed: Array, plus: Array, remainder: Array, where: Pattern | None = None
+    a: Array, packed: Array, plus: Array, is_defined: Array, where: Pattern | None = None
 ) -> Array:
-    """a P a' + plus, packed, NaN unless `known` ()."""
-    return _propagated(where)(a, packed, plus, remainder)
+    """a P a' + plus, packed, NaN unless `is_defined` ()."""
+    return _propagated(where)(a, packed, plus, is_defined)
 
 
 def no_negative(packed: Array) -> Array:
@@ -123,6 +125,8 @@ def inverse(packed: Array) -> tuple[Array, Array]:
     derivative is that of the exact inverse, -P^-1 dP P^-1.
     """
     result = _inverse(packed)
+    # A pivot that was left out leaves a zero on the diagonal of the result. The outer `where` then
+    # gives the identity and cuts the derivative off.
     full_rank = smallest(diagonal(result)) > 0
     identity = pack(jnp.eye(order(packed), dtype=packed.dtype))
     return jnp.where(full_rank, result, identity), full_rank
@@ -133,6 +137,10 @@ def _regress(packed: Array, cross: Array) -> tuple[Array, Array]:
     """Elimination row by row of [[P, B'], [B, 0]], and back for the rows of the weights."""
     (m, n), batch = cross.shape[:2], packed.ndim - 1
     least = _least(packed)
+    # Block elimination of P leaves 0 - B P^-1 B' in the corner: what is explained falls out with
+    # its sign changed, symmetric, and without forming P^-1. The weights B P^-1 follow by going back
+    # through the eliminated rows, as in solving (docs/decisions/estimators.md: "One elimination for
+    # late measurements").
     rest, eliminated = stage(_bordered, packed, cross, batch=batch), []
     for k in range(n):
         reciprocal = stage(_reciprocal, rest[0], least[k], batch=batch)
@@ -215,6 +223,9 @@ def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
         reciprocal = _reciprocal(pivot, least)
         left = jnp.where((rows == k).reshape(shape), -1, packed[places(n)[k, rows]])
         right = jnp.where((cols == k).reshape(shape), -1, packed[places(n)[k, cols]])
+        # One formula for the whole triangle: with -1 in place of the pivot's own row and column,
+        # the pivot becomes -1/p, its row row/p, and the rest is reduced. After all sweeps the
+        # matrix is -P^-1.
         others = jnp.where(((rows == k) | (cols == k)).reshape(shape), 0, packed)
         return others - reciprocal[None] * left * right
 
@@ -241,8 +252,8 @@ def _congruence(where: Pattern | None) -> Callable[[Array, Array], Array]:
 @cache
 def _propagated(where: Pattern | None) -> Callable[..., Array]:
     @kernel
-    def moved(a: Array, packed: Array, plus: Array, remainder: Array) -> Array:
-        return jnp.where(remainder[None], _moved(a, packed, where) + plus, jnp.nan)
+    def moved(a: Array, packed: Array, plus: Array, is_defined: Array) -> Array:
+        return jnp.where(is_defined[None], _moved(a, packed, where) + plus, jnp.nan)
 
     return moved
 
@@ -266,8 +277,13 @@ def _moved(a: Array, packed: Array, where: Pattern | None) -> Array:
     where = where or full(n, n)
     if batch == 0:
         return _pick(multiplied(multiplied(a, _spread(packed)), a.T))
+    # A shared dense a: vec(a P a') = (a x a) vec(P) is one product with all runs as columns. A
+    # sparse one takes fewer operations term by term.
     if a.size == n * n and 2 * sum(map(sum, where)) > n * n:
         return _shared(a, packed)
+    # a P first, then (a P) a': two loops of n terms. As one expression each element would be a sum
+    # of n^2 terms, which XLA cuts into loops that threads share (fast/README.md: "Loops inside a
+    # step stay undivided").
     half = stage(_half(where), a, packed, batch=batch)
     rows, cols = np.triu_indices(n)
     return total(half[rows, k[cols]] * f[cols] for f, k in by_row(a, where))
@@ -284,5 +300,7 @@ def _second_power(a: Array) -> Array:
     """What each element of P counts in each element of a P a', both packed."""
     rows, cols = np.triu_indices(a.shape[0])
     i, j, k, m = rows[:, None], cols[:, None], rows[None], cols[None]
+    # (a P a')_ij = sum_km a_ik P_km a_jm. A packed P_km with k != m stands for two elements, k m
+    # and m k.
     different = jnp.asarray(k != m, a.dtype).reshape(k.shape + (1,) * (a.ndim - 2))
     return a[i, k] * a[j, m] + different * a[i, m] * a[j, k]

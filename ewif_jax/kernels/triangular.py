@@ -38,6 +38,8 @@ def root_of(a: Array) -> Array:
         kept = here[j] > zero[j]
         reciprocal = jnp.where(kept, lax.rsqrt(jnp.where(kept, here[j], 1)), 0)
         place = jnp.asarray(np.arange(n) == j, a.dtype)
+        # A zero in value with a derivative: da / least, halved on the diagonal because L L' counts
+        # that element twice. The product least times dL is then da, as it should be.
         changes = (here - lax.stop_gradient(here)) * (1 - place / 2) / least
         column = jnp.where(kept, here * reciprocal, place * least + changes)
         columns.append(column)
@@ -49,6 +51,8 @@ def small_held(root: Array) -> Array:
     """The root, where columns of what counts as zero are as small as ever: motion would make
     something of them. What they change by is kept in the product with its transpose."""
     least, fixed = least_root(root.dtype), lax.stop_gradient(root)
+    # The value is scaled down and the change scaled up by the same factor: L dL' is what counts,
+    # and it is unchanged.
     size = jnp.max(jnp.abs(fixed), axis=0)
     scale = jnp.where((size > least) & ~is_some(size), least / jnp.maximum(size, least), 1)[None]
     return fixed * scale + (root - fixed) / scale

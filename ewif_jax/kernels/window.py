@@ -45,6 +45,9 @@ def _pulled(first: Array, *kept: Array) -> Array:
 
     def pulled_back(pull_on: Array, one: tuple[Array, ...]) -> tuple[Array, None]:
         later, H, gain, pull, F = one
+        # The adjoint of a filter step: on a state before measurement k act F' times the pull on the
+        # state behind it, through (I - K H)', and H' S^-1 nu of the measurement itself: H'(pull -
+        # K' f) + f (de Jong 1989, Bryson and Frazier 1963).
         force_then = _product(_turned(F), pull_on)
         rest = pull - _product(_turned(gain), force_then)
         return jnp.where(later[None], force_then + _product(_turned(H), rest), pull_on), None
@@ -79,11 +82,16 @@ def _pass(first: Array, *arrays: Array) -> tuple[Array, ...]:
         first, F, H, gain, share = one
         g = stage(_seen, H, first, entry, D, batch=batch)
         half = stage(_less, first, entry, D, gain, g, batch=batch)
+        # Joseph's form in two steps, as in `gaussian.update`: D - K H D, then K times R S^-1 g - H
+        # half. The last is zero in exact numbers and takes out what rounding the gain left.
         rounded = stage(_rounded, share, g, H, half, batch=batch)
         D = stage(_more, half, gain, rounded, batch=batch)
         return stage(_product, F, D, batch=batch), (D, g, rounded)
 
     share = _products(R, weight)
+    # Only D needs the order of time. What is accumulated of U and nu are sums over the
+    # measurements, taken at once after the loop: fewer operations in the scan, which a batch pays
+    # for at every place.
     D, g, rounded = lax.scan(behind, jnp.zeros_like(entry), (first, F, H, gain, share))[1]
     G = _products(weight, g)
     taken = _products(jnp.swapaxes(G, 1, 2), g - rounded)
@@ -129,6 +137,8 @@ def inserted(new: Kept, before: Array, kept: Kept, behind: Passed, R: Array, pla
     it corrected, the oldest gone."""
     D, U, nu, G = behind
     eye = jnp.broadcast_to(jnp.eye(R.shape[0], dtype=R.dtype), U.shape)
+    # For every place at once, though one is used: which one is a traced number, and a batch would
+    # have to gather.
     weight = jax.vmap(cholesky.solved)(U + R[None], eye)
     index = jnp.arange(U.shape[0]) + 1
     flags = index < place, index == place, index + 1 == place
@@ -152,6 +162,9 @@ def _changed(
     gain = stage(_products, D, weight, batch=batch)
     share = stage(_products, G, weight, batch=batch)
     rows, cols = np.triu_indices(D.shape[1])
+    # Each later estimate takes the new measurement as one update with the covariance D and
+    # innovation covariance U + R that hold behind it. Gain and weight follow from the inverse of a
+    # block matrix: the earlier measurement's innovation is no longer independent of the new one.
     corrected = kept._replace(
         mean=kept.mean + total(gain[:, :, j] * nu[:, None, j] for j in range(m)),
         cov=kept.cov - total(D[:, rows, j] * gain[:, cols, j] for j in range(m)),

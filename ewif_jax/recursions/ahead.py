@@ -51,6 +51,8 @@ def ahead(estimator: Estimator, arrivals: int, width: int) -> Estimator:
     def update(
         params: Params, state: AheadState, measurement: Measurement
     ) -> tuple[AheadState, Info]:
+        # The filter inside meets the newest measurement only to say how it predicted it; what it
+        # keeps is the oldest of those that wait. So every rule of arrivals holds for both.
         info = arrive(estimator, params, state.inner, measurement).info
         oldest = jax.tree.map(lambda x: x[0], state.waiting)
         inner = arrive(estimator, params, state.inner, oldest).kept

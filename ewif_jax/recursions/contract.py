@@ -118,6 +118,8 @@ def estimator_from(recursion: Recursion) -> Estimator:
         time = jnp.asarray(time, state.time.dtype)
         if recursion.moves_back:
             return move(params, state, time)
+        # Moved by no time where the time is earlier: NaN made by the motion back would reach the
+        # gradient through the `where` below (inf or NaN times 0).
         moved = move(params, state, jnp.maximum(time, state.time))
         forwards = time >= state.time
         fields = {x: jnp.where(forwards, getattr(moved, x), jnp.nan) for x in recursion.estimated}
@@ -161,6 +163,8 @@ def offered(
     old state to keep and select.
     """
     shown = measurement._replace(
+        # The time too: an update at a time out of reach may be no number at all, though it is
+        # masked.
         time=jnp.where(within_reach, measurement.time, state.time),
         mask=measurement.mask & within_reach,
     )

@@ -89,6 +89,8 @@ def unseen(H: Array, still: int) -> Array:
 
 
 def _inflated(cov: Array, factor: Array) -> Array:
+    # Only the variances grow by the extra share: more variance and equal covariances keep a matrix
+    # positive definite, where equal factors would keep it singular to rounding.
     factor = _saturated(factor, cov)
     rows, cols = np.triu_indices(symmetric.order(cov))
     variances = jnp.asarray(rows == cols, cov.dtype)
@@ -99,6 +101,8 @@ def _inflated(cov: Array, factor: Array) -> Array:
 def _saturated(factor: Array, cov: Array) -> Array:
     factor = jnp.minimum(jnp.asarray(factor, cov.dtype), 1 / jnp.finfo(cov.dtype).eps)
     ceiling = jnp.sqrt(jnp.finfo(cov.dtype).max)
+    # One factor for all elements, from the largest: elements cut off one by one would be no
+    # covariance.
     top = largest(jnp.abs(cov))
     room = ceiling / jnp.where(top > 0, top, 1)
     return jnp.minimum(factor, jnp.maximum(room, 1))

@@ -77,6 +77,8 @@ def delayed(
             def carried(x: Array) -> Array:
                 return ensembles.carried(model, params, x, state.time, time) + noise_met
 
+            # The forecasts of all slots meet the noise that the members met, so that what differs
+            # between them is the measurements alone.
             past = past._replace(ahead=jax.vmap(carried)(past.ahead))
         past = choose(state.used, _pushed(past, state, now.members), past)
         left = EnsembleHistory(*now, jnp.asarray(False), past)
@@ -124,6 +126,8 @@ def _interpolated(state: EnsembleHistory, time: Array) -> Bracket:
     """Eq. (26) between the newest entry not newer than `time` and the next one, which may be now;
     forecasts likewise."""
     past = state.past
+    # Times fall along the slots, so their count is the index; the clamp only serves times that are
+    # out of reach, which are masked.
     newer = jnp.minimum(jnp.sum(past.time > time), past.time.shape[0] - 1)
     after = jnp.maximum(newer - 1, 0)
     last = newer == 0

@@ -54,7 +54,11 @@ def noise(key: Array, root: Array, count: int) -> Array:
     """
     above = np.nextafter(np.float32(-1), np.float32(0))
     uniform = jax.random.uniform(key, (root.shape[1], count), jnp.float32, above, 1)
+    # The inverse of the normal distribution function from uniform numbers in (-1, 1); -1 itself
+    # would be minus infinity.
     drawn = np.sqrt(2, dtype=root.dtype) * lax.erf_inv(uniform.astype(root.dtype))
+    # Without their mean: a sample mean that wanders by sigma / sqrt(N) in every step would be an
+    # error of the estimate that the ensemble's spread does not know.
     return matmul(root, drawn - jnp.mean(drawn, 1, keepdims=True))
 
 
@@ -118,6 +122,7 @@ def look(
 
     offsets = jax.vmap(offset, in_axes=1, out_axes=1)(there)
     shift = mean_of(offsets)
+    # All members or none: a mean over some of them would be another ensemble's.
     every_offset = jnp.all(jnp.isfinite(offsets) | ~mask[:, None])
     deviations = jnp.where(mask[:, None] & every_offset, offsets - shift[:, None], 0)
     # After an exact measurement members differ by rounding only, which would be weighed like
@@ -149,6 +154,8 @@ def transformed(members: Array, looked: Look) -> Array:
     r"""The mean moved by the gain times the innovation, the deviations by
     :math:`\bar K = P_{xz} L'^{-1} (L + G)^{-1}` with :math:`P_{zz} = L L',\; R = G G'`."""
     innovation = looked.innovation
+    # Deviations shrink by L (L + G)^-1 of their size in measurement space, the square root of what
+    # a Kalman filter leaves (Whitaker & Hamill 2002 for one component), and no noise is drawn.
     lower = innovation.factor.lower + looked.noise
     diagonal = jnp.diag(lower)
     kept = diagonal > 0

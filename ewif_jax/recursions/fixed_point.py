@@ -60,6 +60,8 @@ def fixed_point(
         mean, cov = state.mean, state.cov
         moved, F, Q = flow_around(model, points, params, mean, cov, state.time, time, still)
         stands = jnp.append(jnp.zeros(F.shape[0], F.dtype), jnp.ones(still, F.dtype))
+        # The augmented motion (36): the model's F for x(now), the identity for x(tau), no noise on
+        # it.
         F = jnp.pad(F, (0, still)) + jnp.diag(stands)
         Q = jnp.pad(Q, (0, still))
         mean = jnp.concatenate([moved, mean[n:]])
@@ -78,6 +80,8 @@ def fixed_point(
         return choose(last, moved, measured), None
 
     there = ahead(start, tau, 0)
+    # At tau both halves are the same number: all four blocks of the covariance are P. It is
+    # singular, which the update allows.
     twice = jnp.tile(symmetric.unpack(there.cov), (2, 2))
     first = CovarianceState(tau, jnp.tile(there.mean, 2), symmetric.pack(twice))
     # After the measurements once more, only to move on: a second copy would be compiled longer.
@@ -85,6 +89,8 @@ def fixed_point(
     final = jnp.arange(steps.time.shape[0]) == measurements.time.shape[0]
     last = lax.scan(passed, first, (steps, final))[0]
     cov = symmetric.unpack(last.cov)
+    # G' = P_kk^-1 P_k,tau by one triangular factor: what is explained, root' root, is then
+    # symmetric and never more than P_tau,tau but for rounding.
     f = cholesky.factor(cov[:n, :n])
     root = cholesky.forward(f, cov[:n, n:])
     gain = cholesky.backward(f, root).T

@@ -78,6 +78,8 @@ def transport(
     variances = state.variances if fade is None else fade(state.variances)
     faded = state._replace(time=time, mean=mean, variances=variances)
     back, _ = affine_flow(model, params, time, state.time, dtype)
+    # Chains of integrators have an upper triangular F: T F^-1 stays unit upper triangular but for a
+    # scaling of its rows, and no orthogonalisation is needed (half the work of a step of `ewif`).
     if noise is None and where is not None and equations.is_upper(where):
         rows, diagonal = equations.carried(faded.rows, back, where)
         there = faded._replace(
@@ -107,12 +109,17 @@ def moved(
     stable and fast makes the certain more certain, and takes nothing from the rest.
     """
     n = state.mean.shape[0]
+    # Both ways are computed and one is chosen at the end: variances that are infinite would make
+    # NaN, or a NaN slope, in the one that is not.
     variances = jnp.where(jnp.isinf(state.variances), 1, state.variances)
+    # x = T^-1 (targets + e): the errors e move along the columns of F T^-1, and Gram-Schmidt with
+    # their variances makes a triangle of that again (Thornton 1976).
     vectors = matmul(ahead, equations.inverse(state.rows))
     error = matvec(vectors, state.targets)
     if noise is None:
         kept, rows = spread(vectors, variances)
     else:
+        # F P F' + L L' is a sum over 2n independent errors: process noise is n more columns.
         both = jnp.concatenate([variances, jnp.ones_like(variances)])
         kept, rows = spread(jnp.concatenate([vectors, noise], 1), both, certain=True)
     targets = equations.times(rows, error)
@@ -208,6 +215,8 @@ def absorb(
     noise, good = noise_of(gaussian.mask_cov(R, mask), seen, exact)
     good &= ~jnp.any(jnp.isnan(state.variances))
     used = good & jnp.any(mask)
+    # With R = L D L', rows of L^-1 H are equations with independent errors, which are added one by
+    # one: no m x m matrix is inverted, and an exact component is a variance of 0.
     usable, residual = jnp.where(good, seen, 0), jnp.where(good, difference, 0)
     told, apart = cholesky.forward(noise.unit, usable), cholesky.forward(noise.unit, residual)
     sizes = None if size is None else summed(noise.unit, jnp.where(good, size, 0))
@@ -286,6 +295,8 @@ def _info(
 ) -> Info:
     mask = measurement.mask
     is_determined = determined(state)
+    # H T^-1 diag(variances) T^-1' H' is the spread of what is predicted, without the covariance
+    # itself.
     leads = equations.leading(state.rows, seen)
     variances = jnp.where(is_determined, state.variances, 1)
     spread = matmul(leads * variances[None], leads.T)

@@ -23,6 +23,8 @@ def refuse_exact(model: Model, params: Params, t0: Numbers, method: str) -> None
         smallest = float(np.min(diagonal, initial=np.inf))
         if good:
             scale = np.sqrt(diagonal)
+            # Of the correlations, so that units (a range in metres beside an angle in radians) do
+            # not make a good R look singular.
             smallest = float(np.linalg.eigvalsh(R / scale[:, None] / scale).min(initial=np.inf))
             good = smallest > 8 * len(R) * np.finfo(np.float32).eps * 1e-6
         checks.require(

@@ -54,6 +54,7 @@ def _mixed(old: PyTree, new: PyTree, share: Array) -> Any:
     checks.require(
         plain, "softness", "an estimator with means and a covariance as state", type(old).__name__
     )
+    # P - g K S K' = (1 - g) P + g (P - K S K'): a mixture of two covariances, so it is one.
     mean, cov = _mix((old.mean, old.cov), (new.mean, new.cov), share)
     return new._replace(mean=mean, cov=cov)
 

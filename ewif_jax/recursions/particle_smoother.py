@@ -67,6 +67,8 @@ def lines(
     def passed(state: Lines, measurement: Measurement) -> tuple[Lines, None]:
         inside = (measurement.time > tau) & (measurement.time < now)
         inside = inside & jnp.any(measurement.mask)
+        # What is not inside is passed over by `cond`; its time is replaced because `vmap` makes a
+        # `where` of the `cond`, and then both branches run, gradients included.
         safe = measurement._replace(time=jnp.where(inside, measurement.time, state.time))
         return lax.cond(inside, follow, lambda state, _: state, state, safe), None
 
@@ -96,12 +98,16 @@ def look_back(
     origin = weighing.stand_in(model, params, found.numbers, last.fixed, line_weights, measurement)
     offsets = weighing.about(model, origin, found.predicted, found.numbers, measurement)
     center = jnp.mean(ahead, 1, keepdims=True)
+    # White coordinates: with Q = L L' the density of a step is that of a squared distance. About
+    # the centre, because squares of large coordinates would leave no digits of their difference.
     targets, points = (cholesky.forward(f, x - center) for x in (ahead, state.particles))
     best = jnp.max(line_density)
     best = jnp.where(best > -jnp.inf, best, 0)
     density = jnp.exp(line_density - best)
     m = offsets.shape[0]
     squares = (offsets[:, None] * offsets[None]).reshape(m * m, -1)
+    # All sums over the lines have the same weights, so they are columns of one product: the N M
+    # weights are formed block by block and never stored.
     columns = jnp.stack([jnp.ones_like(density), density, *offsets, *squares], 1)
 
     def means(x: Array) -> Array:

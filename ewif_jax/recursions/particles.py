@@ -67,6 +67,8 @@ def drawn(kind: Cloud, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
 
 def noise(key: Array, cov: Array, count: int) -> Array:
     """(n, count) draws from N(0, cov), cov (n, n) singular or not."""
+    # The factor skips pivots that are zero, so that a singular covariance (a constant velocity
+    # driven by one acceleration) needs no small noise added to it.
     normals = jax.random.normal(key, (cov.shape[0], count), cov.dtype)
     return matmul(cholesky.factor(cov).lower, normals)
 
@@ -112,6 +114,8 @@ def step_ahead(
 ) -> tuple[Any, Any]:
     """The state at a later `time`, and what goes along with the particles (pytrees of arrays with
     the particles as the last axis), both resampled first if too few particles count."""
+    # Resampled before the motion, not after the update: copies then part at once by their own
+    # noise, and the estimate is made with the weights before resampling, which has less variance.
     key, first, second = jax.random.split(state.key, 3)
     state, along = renewed(kind, first, state, along)
     _, particles = moved(kind.model, params, state.particles, second, state.time, time)

@@ -50,6 +50,8 @@ def sight(
 def summed(unit: cholesky.Factor, sizes: Array) -> Array:
     """How large the terms (m, n) of whitened equations are, of which the terms were `sizes`."""
     eye = jnp.eye(sizes.shape[0], dtype=sizes.dtype)
+    # Forward substitution with -|L| only adds: what comes out bounds the terms that may cancel in
+    # L^-1 (H A), and rounding is judged by these and not by what is left of them.
     adding = jnp.where(eye > 0, 1, -jnp.abs(unit.lower))
     return cholesky.forward(unit._replace(lower=adding), sizes)
 

@@ -46,6 +46,8 @@ def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> 
     number = checks.concrete_value(spread)
     if number is not None:
         checks.require(number > 0, "ut_kappa", f"a number above -{n}, minus the states", ut_kappa)
+        # Weights of order n / spread, of both signs, multiply values whose differences are small:
+        # with ut_alpha = 1e-3 of the textbooks 1e6 times eps, which is everything in float32.
         lost = float(jnp.finfo(dtype).eps) * n / float(number)
         checks.require(
             lost <= ROUNDING,
@@ -190,6 +192,7 @@ def _regressed(
     The points that are moved along a column of the other components have f of the mean: they spread
     the rest, and each adds to what is left over as the central point does."""
     scale, centre = transform(points, params, mean.shape[0], mean.dtype)
+    # Each of the 2 `still` points that do not move f has the weight 1 / (2 scale).
     centre = centre + still / scale
     mean = mean[: mean.shape[0] - still]
     around = mean[:, None] + sigma_points.offsets(lower, scale)
