@@ -50,6 +50,8 @@ def screen(measurements: Measurement, dtype: DTypeLike) -> Screened:
     time, value, sensor, mask = measurements
     xp = jnp if any(isinstance(x, Array) for x in (time, value, mask)) else np
     with np.errstate(over="ignore", invalid="ignore"):
+        # Squares, because a density needs them: 1e20 is a number in float32 whose square is none,
+        # and its likelihood would be -inf in one entry and NaN in another.
         squares = xp.square(xp.asarray(value, dtype))
         present: Any = xp.broadcast_to(mask, np.shape(value))
         is_time = xp.broadcast_to(xp.isfinite(xp.asarray(time, dtype)), np.shape(value)[:-1])
@@ -81,7 +83,7 @@ def arrive(
     measurement = cast(measurement, state.time.dtype)
     now = state.time if clock_time is None else jnp.maximum(state.time, clock_time)
     stamp = jnp.where(jnp.isfinite(measurement.time), measurement.time, now)
-    now, refused = _place(estimator, state.time, now, stamp, clock_time is not None)
+    now, refused = _clock_place(estimator, state.time, now, stamp, clock_time is not None)
     if refused is not None:
         # Masked, and at a time that the model can answer for: NaN would reach derivatives.
         shown_time = jnp.where(refused, now, stamp)
@@ -99,10 +101,12 @@ def arrive(
     if clock_time is not None:
         kept = updated if refused is None else choose(refused, state, updated)
         return Arrival(kept, updated, info)
+    # A masked row moves nothing, so that padding is a no-op, but it is reported at its own time
+    # (docs/decisions/contract.md: "A masked row does not move the filter").
     return Arrival(choose(jnp.any(shown.mask), updated, state), updated, info)
 
 
-def _place(
+def _clock_place(
     estimator: Estimator, start: Array, now: Array, stamp: Array, by_clock: bool
 ) -> tuple[Array, Array | None]:
     """Where a filter at `start` is when its clock shows `now`, and whether a measurement of time

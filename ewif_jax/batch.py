@@ -123,7 +123,7 @@ def run_batch(
     )
 
 
-def _filtered(
+def _filtered_runs(
     estimator: Estimator,
     inputs: PyTree,
     t0: Numbers,
@@ -141,13 +141,13 @@ def _filtered(
     )
     times = None if times is None else jnp.asarray(times, dtype)
     inputs = (params, measurements, prior, times, keys, context)
-    loop = _loop(estimator, t0, clock, observe or _everything, content.complete, dtype)
+    loop = _run_loop(estimator, t0, clock, observe or _observe_everything, content.complete, dtype)
 
     def filtered(*inputs: Any) -> Any:
         return over_runs(loop, estimator.estimate, inputs, flags.tree)
 
     def screened(*inputs: Any) -> Any:
-        return _screened(loop, estimator, inputs, flags.tree, dtype)
+        return _screened_runs(loop, estimator, inputs, flags.tree, dtype)
 
     run = filtered if content.screened else screened
     on_all = over_devices(run, flags.tree, devices)
@@ -160,7 +160,7 @@ def _filtered(
     return Trace(time, mean, cov, info, state)
 
 
-def _screened(
+def _screened_runs(
     loop: Loop, estimator: Estimator, inputs: PyTree, flags: PyTree, dtype: DTypeLike
 ) -> Any:
     """The same of values that nobody has looked at. A mask for each run costs each run a gain of
@@ -177,16 +177,18 @@ def _screened(
 
     if measurements_f.mask:
         return own_masks()
+    # `cond` over the whole batch runs one of the two: the shared gains are paid for only once, and
+    # a batch without a bad row never computes its own (docs/decisions/contract.md).
     return lax.cond(
         jnp.any(refused), own_masks, lambda: over_runs(loop, estimator.estimate, inputs, flags)
     )
 
 
 _STATIC = ("estimator", "flags", "clock", "observe", "devices", "content", "is_part")
-_run_batch = quick_jit(_filtered, _STATIC, WIDE)
+_run_batch = quick_jit(_filtered_runs, _STATIC, WIDE)
 
 
-def _loop(
+def _run_loop(
     estimator: Estimator,
     t0: Numbers,
     clock: Clock,
@@ -199,6 +201,8 @@ def _loop(
 
     def step(params: Params, state: State, arrival: Numbers) -> tuple[Any, Any]:
         measurement, time, (seen, refused) = arrival
+        # A mask that is known to be whole is made a constant: what keeps the old state of empty
+        # rows is then compiled away.
         if complete and refused is None:
             measurement = measurement._replace(mask=jnp.ones(measurement.mask.shape, bool))
         to = time if clock == "arrival" else None
@@ -213,6 +217,6 @@ def _loop(
     return Loop(start, step)
 
 
-def _everything(step: Step, context: PyTree) -> Step:
+def _observe_everything(step: Step, context: PyTree) -> Step:
     del context
     return step

@@ -46,7 +46,7 @@ def value_charges(
         ahead: how many measured rows earlier they have to have been measured.
         components: which count, (1 or R, T, m); None: all.
     """
-    xp = _module(measurements.value, measurements.sensor, measurements.mask)
+    xp = _array_module(measurements.value, measurements.sensor, measurements.mask)
     # Sums of squares in float64: what float32 cannot square is still compared with its like.
     value = np.asarray(measurements.value, float) if xp is np else jnp.asarray(measurements.value)
     mask = xp.broadcast_to(xp.asarray(measurements.mask, bool), value.shape)
@@ -54,7 +54,7 @@ def value_charges(
     value = xp.where(present, value, 0)
     sensor = xp.broadcast_to(xp.asarray(measurements.sensor), value.shape[:2])
     error, spread = _about_the_mean(value, present, sensor)
-    counted = _foreseen(mask, unknowns, ahead)
+    counted = _foreseen_rows(mask, unknowns, ahead)
     if components is not None:
         present = present & xp.broadcast_to(xp.asarray(components), present.shape)
         counted &= (mask & xp.broadcast_to(xp.asarray(components), mask.shape)).any(-1)
@@ -66,7 +66,7 @@ def value_charges(
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
 
 
-def _foreseen(mask: Numbers, unknowns: int, ahead: int) -> Any:
+def _foreseen_rows(mask: Numbers, unknowns: int, ahead: int) -> Any:
     """Which rows (R, T) are measured, `ahead` measured rows after `unknowns` components have
     been."""
     measured = mask.any(-1)
@@ -87,7 +87,7 @@ def truth_charges(
     measured; of `components` (1 or R, T, k) only those.
     """
     mask = measurements.mask
-    xp = _module(truth, mask)
+    xp = _array_module(truth, mask)
     truth = np.asarray(truth, float) if xp is np else jnp.asarray(truth)
     axes = tuple(range(truth.ndim - 1))
     is_given = _all_of_each(xp.isfinite(truth))
@@ -121,14 +121,14 @@ def length_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
 def crps_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """The continuous ranked probability score of independent Gaussians `WIDTH` times as wide as the
     values spread, summed over components."""
-    xp = _module(error, spread, present)
+    xp = _array_module(error, spread, present)
     score = gaussian_crps(jnp.asarray(error), jnp.asarray(WIDTH * spread))
     return xp.where(present, xp.asarray(score), 0).sum(-1)
 
 
 def energy_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """The energy score of the same Gaussians."""
-    xp = _module(error, spread, present)
+    xp = _array_module(error, spread, present)
     wide = jnp.where(jnp.asarray(present), jnp.asarray(WIDTH * spread), 0)
     flat = wide.reshape(-1, wide.shape[-1])
     errors = jnp.where(jnp.asarray(present), jnp.asarray(error), 0).reshape(flat.shape)
@@ -138,7 +138,7 @@ def energy_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
 
 def density_cost(error: Numbers, spread: Numbers, present: Numbers) -> Any:
     """Minus the log density of independent Gaussians `WIDTH` times as wide as the values spread."""
-    xp = _module(error, spread, present)
+    xp = _array_module(error, spread, present)
     wide = WIDTH * spread
     log = xp.square(error / wide) / 2 + xp.log(wide) + np.log(2 * np.pi) / 2
     return xp.where(present, log, 0).sum(-1)
@@ -169,7 +169,7 @@ def _about_the_mean(value: Numbers, present: Numbers, sensor: Numbers) -> tuple[
     A sensor that always says the same has no spread; its density is then as wide as the value.
     """
     shape = value.shape
-    xp = _module(value, present, sensor)
+    xp = _array_module(value, present, sensor)
     flat, there, which = (x.reshape(-1, *x.shape[2:]) for x in (value, present, sensor))
     if xp is np:
         _, group = np.unique(which, return_inverse=True)
@@ -177,22 +177,22 @@ def _about_the_mean(value: Numbers, present: Numbers, sensor: Numbers) -> tuple[
         _, group = jnp.unique(which, return_inverse=True, size=which.size)
     group = group.reshape(-1)
     groups = int(group.max()) + 1 if xp is np else which.size
-    count = xp.maximum(_sums(there.astype(flat.dtype), group, groups), 1)
-    mean = (_sums(flat, group, groups) / count)[group]
+    count = xp.maximum(_group_sums(there.astype(flat.dtype), group, groups), 1)
+    mean = (_group_sums(flat, group, groups) / count)[group]
     error = xp.where(there, flat - mean, 0)
-    variance = (_sums(xp.square(error), group, groups) / count)[group]
+    variance = (_group_sums(xp.square(error), group, groups) / count)[group]
     level = xp.where(mean == 0, 1, abs(mean))
     spread = xp.where(variance > 0, xp.sqrt(xp.where(variance > 0, variance, 1)), level)
     return error.reshape(shape), spread.reshape(shape)
 
 
-def _sums(x: Numbers, group: Numbers, groups: int) -> Any:
+def _group_sums(x: Numbers, group: Numbers, groups: int) -> Any:
     """Sums (groups, m) of the rows of x (N, m) in each group."""
     if isinstance(x, np.ndarray):
         return np.stack([np.bincount(group, column, groups) for column in x.T], -1)
     return jax.ops.segment_sum(x, group, groups)
 
 
-def _module(*arrays: Any) -> Any:
+def _array_module(*arrays: Any) -> Any:
     """NumPy while all values are known: what the data say once needs no compiled program."""
     return jnp if any(isinstance(x, Tracer) for x in arrays) else np

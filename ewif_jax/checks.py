@@ -77,7 +77,7 @@ def finite(argument: str, x: Numbers, mask: Numbers = True, where: str = "") -> 
     asked = None if squares_are_finite(x) else concrete_value(mask)
     if asked is not None:
         bad = ~np.isfinite(value) & asked
-        require(not bad.any(), argument, f"finite numbers{where}", _first(value, bad))
+        require(not bad.any(), argument, f"finite numbers{where}", _first_bad(value, bad))
 
 
 def squares_are_finite(x: Numbers) -> bool:
@@ -93,7 +93,7 @@ def positive(argument: str, x: Numbers) -> Any:
     value = concrete_value(x)
     if value is not None:
         require(_is_numeric(value), argument, "a positive number", Shown(x))
-        require(np.all(value > 0), argument, "a positive number", _plain(value))
+        require(np.all(value > 0), argument, "a positive number", _plain_value(value))
     return x
 
 
@@ -108,7 +108,7 @@ def at_least(argument: str, x: Numbers, bound: float) -> Any:
     value = concrete_value(x)
     if value is not None:
         require(_is_numeric(value), argument, f"a number >= {bound}", Shown(x))
-        require(np.all(value >= bound), argument, f"a number >= {bound}", _plain(value))
+        require(np.all(value >= bound), argument, f"a number >= {bound}", _plain_value(value))
     return x
 
 
@@ -128,7 +128,7 @@ def psd(argument: str, x: Numbers, definite: bool = False) -> Any:
     square = value.ndim == 2 and value.shape[0] == value.shape[1]
     require(square, argument, "a square matrix", f"shape {value.shape}")
     finite(argument, value)
-    spectrum = _spectrum if value.nbytes <= SMALL else _spectrum.__wrapped__
+    spectrum = _spectrum_of if value.nbytes <= SMALL else _spectrum_of.__wrapped__
     scale, skew, smallest, apart = spectrum(value.astype(float).tobytes(), len(value))
     require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")
     # A singular matrix may have eigenvalues above 0 by rounding, of which an inverse is made.
@@ -139,7 +139,7 @@ def psd(argument: str, x: Numbers, definite: bool = False) -> Any:
 
 
 @lru_cache
-def _spectrum(raw: bytes, n: int) -> tuple[float, float, float, float]:
+def _spectrum_of(raw: bytes, n: int) -> tuple[float, float, float, float]:
     """The largest element of an (n, n) matrix, its asymmetry, its smallest eigenvalue, and that of
     its correlations, which does not depend on units (0 where a variance is not positive)."""
     value = np.frombuffer(raw).reshape(n, n)
@@ -281,11 +281,11 @@ def _is_numeric(value: np.ndarray) -> bool:
     return jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
 
 
-def _plain(value: np.ndarray) -> Any:
+def _plain_value(value: np.ndarray) -> Any:
     return value.item() if value.ndim == 0 else value.tolist()
 
 
-def _first(value: np.ndarray, bad: np.ndarray) -> str:
+def _first_bad(value: np.ndarray, bad: np.ndarray) -> str:
     """The first bad number and where it is."""
     if not bad.any():
         return ""

@@ -36,19 +36,19 @@ def in_seconds(
         ValueError: words, objects, complex numbers, NaT; date-times of some arguments with and of
             others without a zone; t0 or times are date-times, and time is not.
     """
-    stamps = _stamps(name, time)
+    stamps = _stamps_of(name, time)
     dated = stamps is not None and stamps.value.dtype.kind == "M" and stamps.value.size > 0
     first = stamps.value.flat[0] if stamps is not None and dated else None
-    out = [time if stamps is None else _seconds(name, stamps, first)]
+    out = [time if stamps is None else _seconds_since(name, stamps, first)]
     for argument, x in (("t0", t0), ("times", times)):
-        own = None if x is None else _stamps(argument, x)
+        own = None if x is None else _stamps_of(argument, x)
         if own is not None:
             is_date = own.value.dtype.kind == "M"
             require(dated or not is_date, argument, f"seconds, as in {name}", "date-times")
             same = not is_date or stamps is None or own.zoned == stamps.zoned
             zone = "with" if stamps is not None and stamps.zoned else "without"
             require(same, argument, f"date-times {zone} a time zone, as in {name}", Shown(x))
-        out.append(x if own is None else _seconds(argument, own, first))
+        out.append(x if own is None else _seconds_since(argument, own, first))
     time, t0, times = out
     if t0 is not None and type(t0) is not float:
         t0 = plain.numbers("t0", t0)
@@ -58,18 +58,18 @@ def in_seconds(
     return plain.numbers(name, time), t0, times
 
 
-def _seconds(argument: str, stamps: Stamps, first: Numbers) -> np.ndarray:
+def _seconds_since(argument: str, stamps: Stamps, first: Numbers) -> np.ndarray:
     """float64 seconds since `first` of date-times, or of durations."""
     value = stamps.value
     gone = np.isnat(value)
-    require(not gone.any(), argument, "a time in every place", f"NaT at index {_place(gone)}")
+    require(not gone.any(), argument, "a time in every place", f"NaT at index {_bad_place(gone)}")
     unit = np.datetime_data(value.dtype)[0]
     require(unit != "generic", argument, "durations with a unit", value.dtype)
     since = value if value.dtype.kind == "m" else value - first
     return since / np.timedelta64(1, "s")
 
 
-def _stamps(argument: str, x: Numbers) -> Stamps | None:
+def _stamps_of(argument: str, x: Numbers) -> Stamps | None:
     """`x` if it is date-times or durations."""
     if isinstance(x, Array | float | int):
         return None
@@ -139,10 +139,10 @@ def representable(
         change = np.abs(np.diff(rounded) - before)
     held = np.isfinite(rounded).all() and (change <= MOST_TO * before).all()
     if not held:
-        _judge(np.dtype(dtype), finer, ordered.astype(float), rounded, before, change)
+        _judge_times(np.dtype(dtype), finer, ordered.astype(float), rounded, before, change)
 
 
-def _judge(
+def _judge_times(
     dtype: np.dtype,
     given: list[tuple[str, np.ndarray]],
     ordered: np.ndarray,
@@ -208,6 +208,6 @@ def slack(xp: Any, stamp: Numbers, clock: Numbers) -> Any:
     return 4 * xp.finfo(stamp.dtype).eps * xp.maximum(xp.abs(stamp), xp.abs(clock))
 
 
-def _place(bad: np.ndarray) -> Any:
+def _bad_place(bad: np.ndarray) -> Any:
     place = tuple(int(i) for i in np.argwhere(bad)[0]) if bad.any() else ()
     return place[0] if len(place) == 1 else place

@@ -64,11 +64,11 @@ def run(
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = prior_in(prior, float_dtype(measurements.value))
-    filtered = _compiled(measurements.time.shape[0], state, key)
+    filtered = _compiled_run(measurements.time.shape[0], state, key)
     return filtered(estimator, clock, params, measurements, prior, t0, times, key)
 
 
-def _filtered(
+def _filtered_run(
     estimator: Estimator,
     clock: Clock,
     params: Params,
@@ -99,11 +99,11 @@ def _filtered(
 def _filtered_inside(estimator: Estimator, clock: Clock, *inputs: Any) -> Trace:
     """The same as a part of a program that may be differentiated."""
     shared = jax.tree.map(lambda _: False, inputs)
-    return with_few_slopes(partial(_filtered, estimator, clock), shared)(*inputs)
+    return with_few_slopes(partial(_filtered_run, estimator, clock), shared)(*inputs)
 
 
-def _compiled(arrivals: int, state: State, key: RandomKey) -> Any:
-    """`_filtered`, compiled as hard as so many arrivals and such a state deserve."""
+def _compiled_run(arrivals: int, state: State, key: RandomKey) -> Any:
+    """`_filtered_run`, compiled as hard as so many arrivals and such a state deserve."""
     if transformed():
         return _run_inside
     longest = max((x.shape[-1] for x in jax.tree.leaves(state) if x.ndim), default=1)
@@ -115,6 +115,6 @@ def _compiled(arrivals: int, state: State, key: RandomKey) -> Any:
 
 _STATIC = ("estimator", "clock")
 _run_inside = jax.jit(_filtered_inside, static_argnums=(0, 1))
-_run_wide = jax.jit(_filtered, static_argnames=_STATIC)
-_run_small = quick_jit(_filtered, _STATIC, QUICK)
-_run_short = quick_jit(_filtered, _STATIC, QUICKEST)
+_run_wide = jax.jit(_filtered_run, static_argnames=_STATIC)
+_run_small = quick_jit(_filtered_run, _STATIC, QUICK)
+_run_short = quick_jit(_filtered_run, _STATIC, QUICKEST)

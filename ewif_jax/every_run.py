@@ -51,7 +51,7 @@ def examined(
         checks.report_times(times, steps)
         each = np.ndim(times) < 2 or np.shape(times)[0] == runs
         require(each, "times", f"{runs} runs", f"shape {np.shape(times)}")
-    sifted = _sifted(measurements)
+    sifted = _sifted_measurements(measurements)
     shown = sifted.measurements if sifted else measurements
     inputs, flags = flagged(params, params_per_run, shown, prior, times)
     same_runs("params", params, flags[0], runs)
@@ -68,7 +68,7 @@ def _values_at_hand(measurements: Measurement) -> bool:
     return not any(isinstance(x, Tracer) for x in measurements)
 
 
-def _sifted(measurements: Measurement) -> Screened | None:
+def _sifted_measurements(measurements: Measurement) -> Screened | None:
     """The measurements at hand without what is not a number; None if all are numbers. Only a batch
     in which some are not pays for a mask, and so a gain, for every run."""
     dtype = float_dtype(measurements.value)
@@ -198,12 +198,12 @@ def lowest(params: Params, flags: PyTree) -> set[int]:
         if value.dtype.kind == "f" and np.isposinf(value).any():
             runs.add(int(np.argmax(value.reshape(len(value), -1).max(1))))
         elif value.ndim >= 3 and value.shape[-1] == value.shape[-2] and np.isfinite(value).all():
-            eigenvalues = _smallest(value).reshape(len(value), -1).min(1)
+            eigenvalues = _smallest_eigenvalues(value).reshape(len(value), -1).min(1)
             runs.add(int(np.argmin(eigenvalues)))
     return runs
 
 
-def _smallest(matrices: np.ndarray) -> np.ndarray:
+def _smallest_eigenvalues(matrices: np.ndarray) -> np.ndarray:
     """The smallest eigenvalues of the symmetric parts."""
     return np.linalg.eigvalsh((matrices + np.swapaxes(matrices, -1, -2)) / 2)[..., 0]
 
@@ -243,7 +243,7 @@ def _least_definite(cov: np.ndarray, scale: np.ndarray) -> int:
     try:
         factor = np.linalg.cholesky(scaled)  # several times as fast as the eigenvalues
     except np.linalg.LinAlgError:
-        return int(np.argmin(_smallest(scaled)))
+        return int(np.argmin(_smallest_eigenvalues(scaled)))
     # What is left of a variance once the others are known: rounding alone where it is singular.
     left = np.diagonal(factor, axis1=1, axis2=2) ** 2 / np.diagonal(scaled, axis1=1, axis2=2)
     return int(np.argmin(left.min(1)))

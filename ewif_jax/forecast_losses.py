@@ -120,7 +120,7 @@ def nis_shape_loss(
     """
 
     def average_score(charging: Charging) -> Loss:
-        return _shape(charging, scores.surprise)
+        return _shape_loss(charging, scores.surprise)
 
     rows = Rows(where, warm_up)
     return of_predictions(
@@ -128,7 +128,7 @@ def nis_shape_loss(
     )
 
 
-def _shape(charging: Charging, score: Score) -> Loss:
+def _shape_loss(charging: Charging, score: Score) -> Loss:
     def loss(params: Params) -> Array:
         values = charging.raw(params, None, score)
         if charging.unused == "charge":

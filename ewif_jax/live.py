@@ -105,7 +105,9 @@ def step_batch(
     _check_steps_of_tracks(estimator, state, measurement)
     for k in {0, *lowest(params, flags)}:
         own = one_run((params, measurement), (flags, marks), k)
-        _check_arrival(estimator, own[0], state, own[1]._replace(sensor=_largest(measurement)))
+        _check_arrival(
+            estimator, own[0], state, own[1]._replace(sensor=_largest_sensor(measurement))
+        )
     return _step_batch(
         estimator, params, state, measurement, Frozen((flags, every, marks)), transformed()
     )
@@ -146,7 +148,7 @@ def arrivals(measurements: Measurement) -> Iterator[Measurement]:
         yield Measurement(time[k], value[k], sensor[k], mask[k])
 
 
-def _largest(measurement: Measurement) -> Any:
+def _largest_sensor(measurement: Measurement) -> Any:
     index = checks.concrete_value(measurement.sensor)
     return measurement.sensor if index is None else np.int32(index.max(initial=0))
 
@@ -191,7 +193,7 @@ def _check_arrival(
         remembered(question, look)
 
 
-def _stepped(
+def _stepped_runs(
     estimator: Estimator, params: Params, state: State, measurement: Measurement
 ) -> tuple[Any, Info]:
     screened, refused = screen(measurement, state.time.dtype)
@@ -199,15 +201,15 @@ def _stepped(
     return arrival.kept, marked(arrival.info, refused)
 
 
-def _forecasts(estimator: Estimator, params: Params, state: State, times: Array) -> Gaussian:
+def _forecasts_at(estimator: Estimator, params: Params, state: State, times: Array) -> Gaussian:
     def predicted(time: Array) -> Gaussian:
         return estimator.estimate(params, estimator.predict(params, state, time))
 
     return jax.vmap(predicted)(times)
 
 
-_forecast = quick_jit(_forecasts, ("estimator",), QUICKEST)
-_step = quick_jit(_stepped, ("estimator",), QUICKEST)
+_forecast = quick_jit(_forecasts_at, ("estimator",), QUICKEST)
+_step = quick_jit(_stepped_runs, ("estimator",), QUICKEST)
 
 
 def _stepped_batch(
@@ -229,7 +231,7 @@ def _stepped_batch(
         return state
 
     def one_step(params: Params, state: State, arrived: PyTree) -> tuple[Any, Any]:
-        return _stepped(estimator, params, state, arrived[0])
+        return _stepped_runs(estimator, params, state, arrived[0])
 
     def all_tracks(params: Params, states: State, measurement: Measurement) -> tuple[Any, Any]:
         alone = jax.tree.map(
@@ -244,10 +246,10 @@ def _stepped_batch(
     if is_part:
         all_tracks = with_few_slopes(all_tracks, (params_f, states_f, marks))
     info, kept = all_tracks(params, states, measurement)
-    return kept, jax.tree.map(_only, info)
+    return kept, jax.tree.map(_only_run, info)
 
 
-def _only(x: Array) -> Array:
+def _only_run(x: Array) -> Array:
     return x[:, 0]
 
 

@@ -32,7 +32,7 @@ class Simulation(NamedTuple):
 RUN_STEPS = 2**20
 
 
-class _Scenario(NamedTuple):
+class _ScenarioFields(NamedTuple):
     simulate: Callable[..., Simulation]
     prior: Gaussian | None
     t0: Any
@@ -40,7 +40,7 @@ class _Scenario(NamedTuple):
     params: Any = None
 
 
-class Scenario(FromRecipe, _Scenario):
+class Scenario(FromRecipe, _ScenarioFields):
     """A world to draw runs from: simulate(key) -> Simulation, what the filter is told at the
     start (prior, t0), and the clock of `run`.
 
@@ -171,7 +171,7 @@ def monte_carlo(
             devices=devices,
         )
         values = {name: x[:count] for name, x in values.items()}
-        runwise, absent, found = jax.device_get(_summarise(_at_hand(values)))
+        runwise, absent, found = jax.device_get(_summarise_scores(_at_hand(values)))
         per_run.append(runwise)
         missing.append(absent)
         for name, parts in found.items():
@@ -181,7 +181,7 @@ def monte_carlo(
             progress(begin + count, runs)
     per_step = {name: found.mean for name, found in moments.items()}
     errors = {name: standard_error(found) for name, found in moments.items()}
-    return Statistics(_join(per_run), per_step, errors, _join(missing))
+    return Statistics(_join_parts(per_run), per_step, errors, _join_parts(missing))
 
 
 def _one_for_each(key: RandomKey) -> bool:
@@ -244,7 +244,7 @@ def simulate_batch(scenario: Scenario, keys: Array, params: Params = None) -> Si
     # A scenario of a builder is compiled once for all that are equal; one made by hand may hold
     # arrays, which cannot be compared.
     source = scenario if scenario.recipe is not None else scenario.simulate
-    return _simulate(source, takes_params(scenario), keys, params, Frozen(flags))
+    return _simulate_runs(source, takes_params(scenario), keys, params, Frozen(flags))
 
 
 def _all_false(tree: PyTree) -> Any:
@@ -252,7 +252,7 @@ def _all_false(tree: PyTree) -> Any:
 
 
 @partial(jax.jit, static_argnames=("source", "with_params", "flags"))
-def _simulate(
+def _simulate_runs(
     source: Scenario | Callable[..., Simulation],
     with_params: bool,
     keys: Array,
@@ -275,7 +275,7 @@ def _at_hand(values: dict[str, Array]) -> dict[str, Any]:
 
 
 @jax.jit
-def _summarise(values: dict[str, Array]) -> tuple[dict, dict, dict]:
+def _summarise_scores(values: dict[str, Array]) -> tuple[dict, dict, dict]:
     """For each metric (R, T): its average over each run, how many values were left out, and of
     each step the sums that `shifted` reads."""
     is_score = jax.tree.map(lambda x: ~jnp.isnan(x), values)
@@ -292,5 +292,5 @@ def step_sums(values: Array, is_score: Array) -> tuple[Array, Array, Array, Arra
     return count, mean, jnp.sum(apart, 0), jnp.sum(jnp.square(apart), 0)
 
 
-def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _join_parts(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

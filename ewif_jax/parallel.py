@@ -101,7 +101,7 @@ def _run_parallel(
     start = initial(estimator, params, prior, t0, dtype, None)
     times = None if times is None else jnp.asarray(times, dtype)
     blocks = -(-steps // block)
-    padded = jax.tree.map(partial(_padded, to=blocks * block), (measurements, times))
+    padded = jax.tree.map(partial(_padded_series, to=blocks * block), (measurements, times))
     absent = (jnp.arange(blocks * block) >= steps)[:, None]
     measurements = padded[0]._replace(mask=padded[0].mask & ~absent)
     cut = partial(_blocks_last, blocks=blocks)
@@ -135,11 +135,15 @@ def _run_parallel(
         return jax.vmap(fn, in_axes=-1, out_axes=-1)
 
     seen = jnp.where(jnp.any(measurements.mask, 1), measurements.time, start.time)
+    # Each block begins at the time that the filter will have reached there, the newest so far: then
+    # its first arrivals are late in it exactly where they are late in the sequence.
     newest = lax.cummax(jnp.maximum(seen, start.time))[block - 1 : -1 : block]
     empty = all_blocks(from_nothing)(jnp.concatenate([start.time[None], newest]))
+    # Twice the work of `run`, in sqrt(T) rounds of sqrt(T) blocks each: the first pass finds what
+    # every block adds, the second filters from what is carried in.
     stretches, _ = lax.scan(lambda s, m: (all_blocks(lengthen)(s, m), None), empty, arrivals)
-    stretches = jax.tree.map(_leading, stretches)
-    carried_in = jax.tree.map(_trailing, _carried_in(start, stretches, after, method))
+    stretches = jax.tree.map(_leading_axis, stretches)
+    carried_in = jax.tree.map(_trailing_axis, _carried_in(start, stretches, after, method))
     final, outputs = lax.scan(all_blocks(filtered), carried_in, (arrivals, reports))
     time, mean, cov, info = jax.tree.map(lambda x: _joined_blocks(x)[:steps], outputs)
     return Trace(time, mean, cov, info, jax.tree.map(lambda x: x[..., -1], final))
@@ -165,7 +169,7 @@ def _carried_in(
     return lax.associative_scan(pairwise, links)[0]
 
 
-def _padded(x: Array, to: int) -> Array:
+def _padded_series(x: Array, to: int) -> Array:
     """(T, ...) lengthened to (to, ...) with its last entry."""
     last = jnp.broadcast_to(x[-1:], (to - x.shape[0], *x.shape[1:]))
     return jnp.concatenate([jnp.asarray(x), last])
@@ -173,18 +177,18 @@ def _padded(x: Array, to: int) -> Array:
 
 def _blocks_last(x: Array, blocks: int) -> Array:
     """(blocks L, ...) as (L, ..., blocks)."""
-    return _trailing(x.reshape(blocks, -1, *x.shape[1:]))
+    return _trailing_axis(x.reshape(blocks, -1, *x.shape[1:]))
 
 
 def _joined_blocks(x: Array) -> Array:
     """(L, ..., blocks) as (blocks L, ...)."""
-    first = _leading(x)
+    first = _leading_axis(x)
     return first.reshape(-1, *first.shape[2:])
 
 
-def _trailing(x: Array) -> Array:
+def _trailing_axis(x: Array) -> Array:
     return jnp.moveaxis(x, 0, -1)
 
 
-def _leading(x: Array) -> Array:
+def _leading_axis(x: Array) -> Array:
     return jnp.moveaxis(x, -1, 0)

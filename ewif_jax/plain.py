@@ -34,7 +34,7 @@ def numbers(argument: str, x: Numbers, missing: bool = False) -> Any:
         ValueError: complex numbers, words, booleans, date-times, masked elements.
     """
     if isinstance(x, Array):
-        require(_real(x.dtype), argument, "real numbers", x.dtype)
+        require(_real_dtype(x.dtype), argument, "real numbers", x.dtype)
         return x
     require_unmasked(argument, x)
     value = checks.from_rows(argument, x)
@@ -43,7 +43,9 @@ def numbers(argument: str, x: Numbers, missing: bool = False) -> Any:
         strangers = [e for e in value.ravel() if not isinstance(e, good) or isinstance(e, bool)]
         require(not strangers, argument, "real numbers", Shown(next(iter(strangers), None)))
         return value.astype(float)
-    require(_real(value.dtype), argument, "real numbers", value.dtype if value.ndim else Shown(x))
+    require(
+        _real_dtype(value.dtype), argument, "real numbers", value.dtype if value.ndim else Shown(x)
+    )
     longer = value.dtype.kind in "iu" or value.dtype == np.longdouble
     return value.astype(float) if longer else native(value)
 
@@ -61,10 +63,10 @@ def indices(argument: str, x: Numbers) -> Any:
         return x.astype(np.int32)
     value = value if value.dtype.kind in "iu" else numbers(argument, x)
     whole = np.isfinite(value) & (value == np.floor(value))
-    require(whole.all(), argument, "whole numbers", Shown(_first(value, ~whole)))
+    require(whole.all(), argument, "whole numbers", Shown(_first_bad_value(value, ~whole)))
     inside = (value >= 0) & (value <= np.iinfo(np.int32).max)
     expected = "indices >= 0 that fit into int32"
-    require(inside.all(), argument, expected, Shown(_first(value, ~inside)))
+    require(inside.all(), argument, expected, Shown(_first_bad_value(value, ~inside)))
     return x.astype(np.int32) if isinstance(x, Array) else value.astype(np.int32)
 
 
@@ -85,7 +87,9 @@ def booleans(argument: str, x: Numbers) -> Any:
     elif value.dtype != bool:
         require(value.dtype.kind in "iu", argument, "booleans", value.dtype)
         odd = (value != 0) & (value != 1)
-        require(not odd.any(), argument, "booleans (or 0 and 1)", Shown(_first(value, odd)))
+        require(
+            not odd.any(), argument, "booleans (or 0 and 1)", Shown(_first_bad_value(value, odd))
+        )
     return value.astype(bool)
 
 
@@ -95,10 +99,10 @@ def parameters(params: Params) -> Any:
     Raises:
         ValueError: a leaf of words, date-times, objects or masked elements, by its name.
     """
-    return tree_map_with_path(_parameter, params)
+    return tree_map_with_path(_parameter_leaf, params)
 
 
-def _parameter(path: Any, x: Numbers) -> Any:
+def _parameter_leaf(path: Any, x: Numbers) -> Any:
     if isinstance(x, Array | float | int):
         return x
     require_unmasked(f"params{keystr(path)}", x)
@@ -124,9 +128,9 @@ def require_unmasked(argument: str, x: Numbers) -> None:
     )
 
 
-def _real(dtype: DTypeLike) -> bool:
+def _real_dtype(dtype: DTypeLike) -> bool:
     return jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
 
 
-def _first(value: np.ndarray, bad: np.ndarray) -> Any:
+def _first_bad_value(value: np.ndarray, bad: np.ndarray) -> Any:
     return value[bad].flat[0].item() if bad.any() else None

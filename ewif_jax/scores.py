@@ -64,13 +64,13 @@ def negative_log_likelihood(step: Step, truth: Array, mask: Array) -> Array:
 def squared_innovation(step: Step, truth: Array, mask: Array) -> Array:
     """Squared one-step prediction error; NaN if the measurement was not used."""
     del truth, mask
-    return _where_used(step, _square(step))
+    return _where_used(step, _squared_length(step))
 
 
 def robust_innovation(step: Step, truth: Array, mask: Array) -> Array:
     """Length of the one-step prediction error, which outliers pull less; NaN as above."""
     del truth, mask
-    square = _square(step)
+    square = _squared_length(step)
     length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), square)
     return _where_used(step, length)
 
@@ -80,7 +80,7 @@ def crps(step: Step, truth: Array, mask: Array) -> Array:
     NaN if the measurement was not used."""
     del truth
     spread = jnp.diagonal(step.info.innovation_cov)
-    each = gaussian_crps(_defined(step), _root(spread))
+    each = gaussian_crps(_defined_innovation(step), _safe_root(spread))
     return _where_used(step, jnp.sum(jnp.where(mask, each, 0)))
 
 
@@ -90,7 +90,7 @@ def energy(step: Step, truth: Array, mask: Array) -> Array:
     both = mask[:, None] & mask[None, :]
     cov = jnp.where(both, step.info.innovation_cov, 0)
     cov = jnp.where(jnp.all(jnp.isfinite(cov)), cov, 0)
-    return _where_used(step, gaussian_energy(_defined(step), cov))
+    return _where_used(step, gaussian_energy(_defined_innovation(step), cov))
 
 
 def surprise(step: Step, truth: Array, mask: Array) -> Array:
@@ -116,7 +116,7 @@ def _of_values(score: Score) -> Score:
     def of_some(step: Step, truth: Array, mask: Array) -> Array:
         info = step.info
         innovation = gaussian.innovate(
-            _defined(step),
+            _defined_innovation(step),
             jnp.zeros((mask.shape[0], 1), step.mean.dtype),
             info.innovation_cov,
             mask,
@@ -148,13 +148,13 @@ def _of_truth(score: Score) -> Score:
     return of_some
 
 
-def _defined(step: Step) -> Array:
+def _defined_innovation(step: Step) -> Array:
     """The innovation; 0 where it is not a number."""
     innovation = step.info.innovation
     return jnp.where(jnp.isfinite(innovation), innovation, 0)
 
 
-def _root(x: Array) -> Array:
+def _safe_root(x: Array) -> Array:
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1)), 0)
 
@@ -262,7 +262,7 @@ def score_of(name: str, score: Score, step: Step, truth: Array, mask: Array) -> 
     return jnp.asarray(found)
 
 
-def _used(step: Step) -> Array:
+def _is_used(step: Step) -> Array:
     return (step.info.status == Status.USED) | (step.info.status == Status.LATE_USED)
 
 
@@ -274,7 +274,7 @@ def _where_used(step: Step, score: Array) -> Array:
     kept = jnp.where(jnp.isnan(score), jnp.inf, score)
     # What is not predicted has log likelihood 0 if nothing is known; else it is -inf or NaN.
     silent = jnp.where(jnp.isfinite(log_likelihood), _silent_or_broken(step), jnp.inf)
-    return jnp.where(_used(step), jnp.where(said, kept, silent), _silent_or_broken(step))
+    return jnp.where(_is_used(step), jnp.where(said, kept, silent), _silent_or_broken(step))
 
 
 def _silent_or_broken(step: Step) -> Array:
@@ -289,8 +289,8 @@ def _silent_or_broken(step: Step) -> Array:
     return jnp.where(is_broken, jnp.inf, jnp.nan)
 
 
-def _square(step: Step) -> Array:
+def _squared_length(step: Step) -> Array:
     """The squared length of the innovation; 0 where it is not a number."""
     innovation = step.info.innovation
-    is_defined = _used(step) & jnp.all(jnp.isfinite(innovation))
+    is_defined = _is_used(step) & jnp.all(jnp.isfinite(innovation))
     return jnp.sum(jnp.square(jnp.where(is_defined, innovation, 0)))

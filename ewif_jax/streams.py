@@ -114,13 +114,15 @@ def newest(times: Numbers, truth: Numbers) -> Any:
     checks.require(rows, "truth", f"{np.shape(times)[0]} rows", f"shape {np.shape(truth)}")
     if isinstance(times, Array) or isinstance(truth, Array):
         times, truth = jnp.asarray(times), jnp.asarray(truth)
-        latest = jnp.where(times >= jnp.asarray(_running(jnp, times)), jnp.arange(times.size), 0)
-        return truth[_running(jnp, latest)]
-    latest = np.where(times >= _running(np, times), np.arange(times.size), 0)
-    return truth[_running(np, latest)]
+        latest = jnp.where(
+            times >= jnp.asarray(_running_maximum(jnp, times)), jnp.arange(times.size), 0
+        )
+        return truth[_running_maximum(jnp, latest)]
+    latest = np.where(times >= _running_maximum(np, times), np.arange(times.size), 0)
+    return truth[_running_maximum(np, latest)]
 
 
-def _running(xp: Any, x: Numbers) -> Any:
+def _running_maximum(xp: Any, x: Numbers) -> Any:
     """The running maximum."""
     return xp.maximum.accumulate(x)
 

@@ -11,25 +11,25 @@ from ewif_jax import checks
 from ewif_jax.recipe import FromRecipe, from_recipe
 
 
-class _Transform(NamedTuple):
+class _TransformFields(NamedTuple):
     constrain: Callable[[Array], Array]
     free: Callable[[Array], Array]
 
 
-class Transform(FromRecipe, _Transform):
+class Transform(FromRecipe, _TransformFields):
     """A smooth map from free numbers to a constrained parameter, and its inverse."""
 
 
 @from_recipe
 def unconstrained() -> Transform:
     """Any real numbers."""
-    return Transform(_identity, _identity)
+    return Transform(_identity_map, _identity_map)
 
 
 @from_recipe
 def positive() -> Transform:
     """Positive numbers through their logarithm: steps are relative, as suits tau, q and r."""
-    return Transform(_exponential, _logarithm)
+    return Transform(_exponential_map, _logarithm_map)
 
 
 @from_recipe
@@ -83,15 +83,15 @@ class _FromInterval(NamedTuple):
         return jnp.log(inside - self.low) - jnp.log(self.high - inside)
 
 
-def _identity(x: Array) -> Array:
+def _identity_map(x: Array) -> Array:
     return x
 
 
-def _exponential(x: Array) -> Array:
+def _exponential_map(x: Array) -> Array:
     return jnp.exp(x)
 
 
-def _logarithm(x: Array) -> Array:
+def _logarithm_map(x: Array) -> Array:
     return jnp.log(x)
 
 

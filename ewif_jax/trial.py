@@ -49,7 +49,7 @@ def validated(
     last = None if sensors is None else np.int32(sensors.max())
 
     def first() -> Any:
-        given = jax.tree.map(_indexable, params)
+        given = jax.tree.map(_as_indexable, params)
         state = initial(estimator, given, prior, t0, dtype, key)
         if not last and not jax.tree.leaves(params):
             return state  # nothing is known that the program itself would not refuse
@@ -64,7 +64,7 @@ def validated(
     # Trying takes longer than filtering a short stream, so equal trials are made once.
     x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
     setting = np.shape(measurements.value), times is None, clock, dtype, key is None, x64
-    question = _question(estimator, setting, (params, prior, t0, last))
+    question = _trial_question(estimator, setting, (params, prior, t0, last))
 
     def tried() -> Any:
         model, stamps = estimator.model, measurements.time
@@ -85,7 +85,7 @@ def validated(
         and model is not None
         and hasattr(getattr(state, "current", state), "cov")
     ):
-        asked = _question(estimator, setting, (params, prior, t0, rows))
+        asked = _trial_question(estimator, setting, (params, prior, t0, rows))
         if asked is not None:  # else something is traced
             remembered(asked, lambda: check_prior_width(model, params, prior, t0, rows, dtype))
     return state
@@ -111,7 +111,7 @@ def _name_parameters(params: Params, error: TypeError) -> None:
         ) from error
 
 
-def _question(estimator: Estimator, setting: Hashable, values: PyTree) -> Hashable | None:
+def _trial_question(estimator: Estimator, setting: Hashable, values: PyTree) -> Hashable | None:
     """What tells this trial from others; None while something is being traced."""
     filtered = question_of(estimator)
     leaves, structure = jax.tree.flatten(values)
@@ -121,7 +121,7 @@ def _question(estimator: Estimator, setting: Hashable, values: PyTree) -> Hashab
     return filtered, setting, structure, *((x.shape, x.dtype, digest(x)) for x in arrays)
 
 
-def _indexable(x: Numbers) -> Any:
+def _as_indexable(x: Numbers) -> Any:
     """`x`, its value known as before; but a NumPy table cannot be indexed while tracing."""
     with jax.ensure_compile_time_eval():
         return array(x) if isinstance(x, np.ndarray) else x

@@ -83,20 +83,20 @@ def weighted_covariances(system: System, cov0: Array, *, fading: Array, steps: i
     checks.shape("cov0", cov0, ("n", "n"))
     checks.psd("cov0", cov0)
     check_system("system", system, np.shape(cov0)[:1], steps)
-    return _weighted_covariances(system, _floats(cov0), fading, steps)
+    return _weighted_covariances(system, _as_floats(cov0), fading, steps)
 
 
 @partial(jax.jit, static_argnames="steps")
 def _weighted_covariances(system: System, cov0: Array, fading: Array, steps: int) -> Weighted:
     def body(cov: Array, step: tuple[System, Array]) -> tuple[Array, Weighted]:
         (F, H, Q, R), alpha = step
-        predicted = _symmetric(alpha**2 * F @ cov @ F.T + Q)
+        predicted = _made_symmetric(alpha**2 * F @ cov @ F.T + Q)
         K = gain(predicted, H, R)
-        cov = _updated(predicted, K, H, R)
+        cov = _updated_cov(predicted, K, H, R)
         return cov, Weighted(predicted, cov, K)
 
     alphas = jnp.broadcast_to(jnp.asarray(fading, cov0.dtype), (steps,))
-    return lax.scan(body, cov0, (_stacked(system, steps), alphas))[1]
+    return lax.scan(body, cov0, (_stacked_system(system, steps), alphas))[1]
 
 
 def actual_error(
@@ -138,7 +138,7 @@ def actual_error(
         check_system("design", design, (n,), steps, m)
     if mean0 is not None:
         checks.shape("mean0", mean0, (n,))
-    return _actual_error(_floats(gain), system, _floats(cov0), design, mean0)
+    return _actual_error(_as_floats(gain), system, _as_floats(cov0), design, mean0)
 
 
 @jax.jit
@@ -146,12 +146,12 @@ def _actual_error(
     gain: Array, system: System, cov0: Array, design: System | None, mean0: Array | None
 ) -> Array:
     steps, n = gain.shape[:2]
-    truth = _stacked(system, steps)
+    truth = _stacked_system(system, steps)
     if design is None:
 
         def body(E: Array, step: tuple[System, Array]) -> tuple[Array, Array]:
             (F, H, Q, R), K = step
-            E = _updated(F @ E @ F.T + Q, K, H, R)
+            E = _updated_cov(F @ E @ F.T + Q, K, H, R)
             return E, E
 
         return lax.scan(body, cov0, (truth, gain))[1]
@@ -164,10 +164,10 @@ def _actual_error(
         left, kept = eye - K @ H, (eye - K @ H_used) @ F_used
         move = jnp.block([[F, jnp.zeros_like(F)], [left @ F - kept, kept]])
         noise = jnp.block([[Q, Q @ left.T], [left @ Q, left @ Q @ left.T + K @ R @ K.T]])
-        S = _symmetric(move @ S @ move.T + noise)
+        S = _made_symmetric(move @ S @ move.T + noise)
         return S, S[n:, n:]
 
-    return lax.scan(both, moments, (truth, _stacked(design, steps), gain))[1]
+    return lax.scan(both, moments, (truth, _stacked_system(design, steps), gain))[1]
 
 
 def error_bounds(system: System, cov0: Array, *, fading: Array, steps: int) -> Bounds:
@@ -226,7 +226,7 @@ def steady_state(system: System, *, fading: Array = 1.0) -> SteadyState:  # type
     checks.shape("fading", fading, ())
     check_system("system", system, np.shape(system[0])[:1])
     checks.psd("system.R", system[3], definite=True)
-    F, H, Q, R = (_floats(x) for x in system)
+    F, H, Q, R = (_as_floats(x) for x in system)
     weighted = jnp.asarray(fading, F.dtype) * F
     require_steady_state(weighted, H, Q, on_edge=lambda values: np.abs(values) - 1)
     return _steady_state(System(F, H, Q, R), weighted)
@@ -239,7 +239,7 @@ def _steady_state(system: System, weighted: Array) -> SteadyState:
     K = gain(predicted, H, R)
     left = jnp.eye(F.shape[0], dtype=F.dtype) - K @ H
     error = discrete_lyapunov(left @ F, left @ Q @ left.T + K @ R @ K.T)
-    return SteadyState(predicted, _updated(predicted, K, H, R), error, K, F @ left)
+    return SteadyState(predicted, _updated_cov(predicted, K, H, R), error, K, F @ left)
 
 
 def check_system(
@@ -264,21 +264,21 @@ def check_system(
                 checks.psd(f"{label}[{k}]" if stacked else label, one)
 
 
-def _floats(x: Numbers) -> Array:
+def _as_floats(x: Numbers) -> Array:
     x = jnp.asarray(x)
     return x.astype(float_dtype(x))
 
 
-def _updated(predicted: Array, K: Array, H: Array, R: Array) -> Array:
+def _updated_cov(predicted: Array, K: Array, H: Array, R: Array) -> Array:
     left = jnp.eye(K.shape[0], dtype=K.dtype) - K @ H
-    return _symmetric(left @ predicted @ left.T + K @ R @ K.T)
+    return _made_symmetric(left @ predicted @ left.T + K @ R @ K.T)
 
 
-def _symmetric(x: Array) -> Array:
+def _made_symmetric(x: Array) -> Array:
     return (x + x.T) / 2
 
 
-def _stacked(system: System, steps: int) -> System:
+def _stacked_system(system: System, steps: int) -> System:
     """Every matrix stacked (T, ...)."""
     arrays = (jnp.asarray(x) for x in system)
     return System(*(x if x.ndim == 3 else jnp.broadcast_to(x, (steps, *x.shape)) for x in arrays))

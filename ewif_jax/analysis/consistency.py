@@ -22,11 +22,11 @@ def rmse(mean: Array, truth: Array, axis: int | tuple[int, ...] | None = None) -
 
     Steps where the estimate is NaN (nothing known yet) are left out.
     """
-    return _rms(jnp.asarray(mean), jnp.asarray(truth), axis)
+    return _rms_error(jnp.asarray(mean), jnp.asarray(truth), axis)
 
 
 @partial(jax.jit, static_argnames="axis", inline=True)
-def _rms(mean: Array, truth: Array, axis: int | tuple[int, ...] | None) -> Array:
+def _rms_error(mean: Array, truth: Array, axis: int | tuple[int, ...] | None) -> Array:
     error = mean[..., : truth.shape[-1]] - truth
     all_finite = jnp.all(jnp.isfinite(error), -1)
     square = jnp.sum(jnp.square(jnp.where(all_finite[..., None], error, 0)), -1)
@@ -44,7 +44,7 @@ def nees(mean: Array, cov: Array, truth: Array) -> Array:
 
     Chi-square with k degrees of freedom (mean k) if the filter is consistent.
     """
-    return _normalised(array(mean), array(cov), array(truth))
+    return _normalised_error(array(mean), array(cov), array(truth))
 
 
 def nis(info: Info) -> Array:
@@ -52,7 +52,7 @@ def nis(info: Info) -> Array:
 
     Chi-square with as many degrees of freedom as components were present; 0 where none was.
     """
-    return _quadratic(info.innovation, info.innovation_cov)
+    return _quadratic_form(info.innovation, info.innovation_cov)
 
 
 def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float]:
@@ -72,13 +72,13 @@ def chi2_band(dof: int, samples: int, level: float = 0.95) -> tuple[float, float
 
 
 @partial(jax.jit, inline=True)
-def _normalised(mean: Array, cov: Array, truth: Array) -> Array:
+def _normalised_error(mean: Array, cov: Array, truth: Array) -> Array:
     k = truth.shape[-1]
-    return _quadratic(mean[..., :k] - truth, cov[..., :k, :k])
+    return _quadratic_form(mean[..., :k] - truth, cov[..., :k, :k])
 
 
 @partial(jax.jit, inline=True)
-def _quadratic(error: Array, cov: Array) -> Array:
+def _quadratic_form(error: Array, cov: Array) -> Array:
     lead = error.shape[:-1]
     flat = error.reshape(-1, error.shape[-1])
     matrices = cov.reshape(-1, *cov.shape[-2:])

@@ -68,7 +68,7 @@ def crlb(
         checks.shape("information", information, (n, n))
         checks.psd("information", information)
         information = jnp.asarray(information, dtype)
-    return _crlb(model, weight, params, stream, state, time, information)
+    return _bound_along(model, weight, params, stream, state, time, information)
 
 
 def check_finite_information(model: Model, params: Params, measurements: Measurement) -> None:
@@ -102,7 +102,7 @@ def _full_rank(R: np.ndarray) -> bool:
 
 
 @partial(jax.jit, static_argnames=("model", "weight"))
-def _crlb(
+def _bound_along(
     model: Model,
     weight: Callable[..., Array] | None,
     params: Params,

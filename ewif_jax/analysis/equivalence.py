@@ -84,7 +84,7 @@ def equivalent_tau(
         gain = settled_gain(exponential, (tau, params), m, dt, steps)
         return _relative_difference(gain, target)
 
-    by_gain = _minimise(mismatch, low, high)
+    by_gain = _finest_minimum(mismatch, low, high)
     if case is None:
         return by_gain
     wanted = _mean_mse(noisy, params, case)
@@ -135,7 +135,7 @@ def equivalent_process_noise(
         gain = settled_gain(noisy, params_of(q), m, dt, steps)
         return _relative_difference(gain, target)
 
-    by_gain = _minimise(mismatch, low, high)
+    by_gain = _finest_minimum(mismatch, low, high)
     if case is None:
         return by_gain
     wanted = _mean_mse(exponential, some, case)
@@ -170,7 +170,7 @@ def _mean_mse(estimator: Estimator, params: Params, case: Case) -> Array:
     return jnp.nanmean(mse)
 
 
-def _minimise(fn: Callable[[Array], Array], low: float, high: float) -> float:
+def _finest_minimum(fn: Callable[[Array], Array], low: float, high: float) -> float:
     """The minimiser in [low, high] by ever finer logarithmic grids, all points at once."""
     evaluate = jax.jit(jax.vmap(fn))
     a, b = np.log(low), np.log(high)
@@ -192,7 +192,7 @@ def _nearest_root(fn: Callable[[Array], Array], low: float, high: float, near: f
     value = np.asarray(evaluate(jnp.exp(grid)))
     crossing = np.flatnonzero(np.sign(value[:-1]) * np.sign(value[1:]) <= 0)
     if crossing.size == 0:
-        nearest = _minimise(lambda x: jnp.abs(fn(x)), low, high)
+        nearest = _finest_minimum(lambda x: jnp.abs(fn(x)), low, high)
         least = float(fn(jnp.asarray(nearest)))
         expected = f"a value from {low:g} to {high:g} with the same expected error"
         got = f"none; nearest is {nearest:.6g}, whose mean square error differs by {least:.3g}"

@@ -60,11 +60,11 @@ def gain_history(
         checks.psd(f"Q[{k}]", one)
     checks.psd("R", R, definite=True)
     checks.psd("first_cov", cov)
-    return _followed(F, H, Q, R, cov, lag)
+    return _gains_along(F, H, Q, R, cov, lag)
 
 
 @partial(jax.jit, static_argnames="lag")
-def _followed(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> GainHistory:
+def _gains_along(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -> GainHistory:
     m, n = H.shape
     eye = jnp.eye(n, dtype=F.dtype)
 

@@ -39,7 +39,7 @@ def steady_state_gain(F: Numbers, H: Numbers, Q: Numbers, R: Numbers) -> Array:
 
     Reduces to: `random_walk_gain`, `alpha_beta_gains`.
     """
-    return _steady_gain(*_system(F, H, Q, R))
+    return _steady_gain(*_checked_system(F, H, Q, R))
 
 
 def delayed_gain(F: Numbers, H: Numbers, Q: Numbers, R: Numbers, steps: Numbers) -> Array:
@@ -58,13 +58,13 @@ def delayed_gain(F: Numbers, H: Numbers, Q: Numbers, R: Numbers, steps: Numbers)
 
     Reduces to: `steady_state_gain` at 0; eq. (7) for a random walk.
     """
-    system = _system(F, H, Q, R)
+    system = _checked_system(F, H, Q, R)
     checks.at_least("steps", steps, 0)
     checks.shape("steps", steps, ())
     if isinstance(steps, int | np.integer):
-        K, loop = _settled(*system)
+        K, loop = _steady_loop(*system)
         return jnp.linalg.matrix_power(loop, operator.index(steps)) @ K
-    return _delayed(*system, jnp.asarray(steps, system[0].dtype))
+    return _gain_after(*system, jnp.asarray(steps, system[0].dtype))
 
 
 def cutoff_delay(
@@ -102,10 +102,10 @@ def cutoff_delay(
     Deviations: (8) is for one state; here any number, by the norm. The text after (8) keeps
         "T >= T_d"; T <= T_d is meant.
     """
-    _fraction(ratio)
+    _check_ratio(ratio)
     checks.positive("interval", interval)
-    system = _system(F, H, Q, R)
-    return interval * _cutoff(*system, jnp.asarray(ratio, system[0].dtype))
+    system = _checked_system(F, H, Q, R)
+    return interval * _cutoff_steps(*system, jnp.asarray(ratio, system[0].dtype))
 
 
 def maneuvering_index(
@@ -168,7 +168,7 @@ def random_walk_cutoff(index: Numbers, *, ratio: Numbers = 0.6, interval: Number
     Raises:
         ValueError: index <= 0; ratio outside (0, 1); interval <= 0.
     """
-    _fraction(ratio)
+    _check_ratio(ratio)
     checks.positive("interval", interval)
     index = jnp.asarray(checks.positive("index", index))
     return -interval * jnp.log(ratio) / (2 * jnp.arcsinh(index / 2))
@@ -221,32 +221,34 @@ def _steady_gain(F: Array, H: Array, Q: Array, R: Array) -> Array:
 
 
 @jax.jit
-def _settled(F: Array, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
+def _steady_loop(F: Array, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     """K, and (I - K H) F."""
     K = gain(predicted_dare(F, H, Q, R), H, R)
     return K, (jnp.eye(F.shape[0], dtype=F.dtype) - K @ H) @ F
 
 
 @jax.jit
-def _delayed(F: Array, H: Array, Q: Array, R: Array, steps: Array) -> Array:
-    K, loop = _settled(F, H, Q, R)
+def _gain_after(F: Array, H: Array, Q: Array, R: Array, steps: Array) -> Array:
+    K, loop = _steady_loop(F, H, Q, R)
     return real_power(loop, steps) @ K
 
 
 @jax.jit
-def _cutoff(F: Array, H: Array, Q: Array, R: Array, ratio: Array) -> Array:
-    K, loop = _settled(F, H, Q, R)
+def _cutoff_steps(F: Array, H: Array, Q: Array, R: Array, ratio: Array) -> Array:
+    K, loop = _steady_loop(F, H, Q, R)
     return last_time_above(loop, K, ratio)
 
 
-def _fraction(ratio: Numbers) -> None:
+def _check_ratio(ratio: Numbers) -> None:
     value = checks.concrete_value(ratio)
     if value is not None:
         good = np.all((value > 0) & (value < 1))
         checks.require(good, "ratio", "a number between 0 and 1", ratio)
 
 
-def _system(F: Numbers, H: Numbers, Q: Numbers, R: Numbers) -> tuple[Array, Array, Array, Array]:
+def _checked_system(
+    F: Numbers, H: Numbers, Q: Numbers, R: Numbers
+) -> tuple[Array, Array, Array, Array]:
     """The four matrices in one float dtype; numbers become (1, 1)."""
     matrices = [jnp.atleast_2d(jnp.asarray(x)) for x in (F, H, Q, R)]
     dtype = jnp.result_type(*matrices)

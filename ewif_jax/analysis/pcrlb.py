@@ -70,7 +70,7 @@ def pcrlb(
     """
     many = jnp.ndim(truth) == 3
     truth, start = (x if many else jnp.asarray(x)[None] for x in (truth, start))
-    stream, truth, first = _checked(model, params, measurements, truth, start, prior_cov, t0)
+    stream, truth, first = _checked_inputs(model, params, measurements, truth, start, prior_cov, t0)
     time = checks.concrete_value(measurements.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
@@ -114,7 +114,7 @@ def pcrlb_late(
     Raises:
         ValueError: as in `pcrlb`, except that measurement times may go back.
     """
-    arrived, truth, first = _checked(
+    arrived, truth, first = _checked_inputs(
         model,
         params,
         measurements,
@@ -168,7 +168,7 @@ def pcrlb_equivalent(
     Raises:
         ValueError: as in `pcrlb_late`; report times that go back.
     """
-    stream, truth, first = _checked(
+    stream, truth, first = _checked_inputs(
         model,
         params,
         measurements,
@@ -179,7 +179,7 @@ def pcrlb_equivalent(
     )
     checks.report_times(times, truth.shape[1])
     times = jnp.asarray(times, truth.dtype)
-    return _equivalent(model, params, stream, truth[0], first, times)
+    return _equivalent_bound(model, params, stream, truth[0], first, times)
 
 
 @partial(jax.jit, static_argnames="model")
@@ -189,8 +189,8 @@ def _in_order(
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
         measurement, states = now
-        moved = _moved(model, params, cov, before, last, measurement.time)
-        after = _informed(moved, _information(model, params, states, measurement))
+        moved = _moved_bound(model, params, cov, before, last, measurement.time)
+        after = _informed_bound(moved, _expected_information(model, params, states, measurement))
         return (after, states, measurement.time), after
 
     return lax.scan(body, first, (stream, jnp.moveaxis(truth, 0, 1)))[1]
@@ -200,6 +200,8 @@ def _in_order(
 def _as_it_arrives(
     model: Model, params: Params, arrived: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
+    # Sorted once; report k passes over what has not arrived by then. The bound of a late
+    # measurement depends on all states between, so there is no shorter way than from the start.
     order = jnp.argsort(arrived.time, stable=True)
     stream, states = jax.tree.map(lambda x: x[order], (arrived, truth))
 
@@ -207,37 +209,41 @@ def _as_it_arrives(
         def body(carry: tuple, now: tuple) -> tuple[tuple, None]:
             cov, before, last = carry
             measurement, state, place = now
-            moved = _moved(model, params, cov, before, last, measurement.time)
-            after = _informed(moved, _information(model, params, state[None], measurement))
+            moved = _moved_bound(model, params, cov, before, last, measurement.time)
+            after = _informed_bound(
+                moved, _expected_information(model, params, state[None], measurement)
+            )
             here = (after, state[None], measurement.time)
             return choose((place <= number) & jnp.any(measurement.mask), here, carry), None
 
         bound, _ = lax.scan(body, first, (stream, states, order))
-        return jnp.where(time >= bound[2], _moved(model, params, *bound, time), jnp.nan)
+        return jnp.where(time >= bound[2], _moved_bound(model, params, *bound, time), jnp.nan)
 
     return jax.vmap(report)(jnp.arange(times.shape[0]), times)
 
 
 @partial(jax.jit, static_argnames="model")
-def _equivalent(
+def _equivalent_bound(
     model: Model, params: Params, stream: Measurement, truth: Array, first: Bound, times: Array
 ) -> Array:
     def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
         cov, before, last = carry
         measurement, state, time = now
-        moved = _moved(model, params, cov, before, last, time)
+        moved = _moved_bound(model, params, cov, before, last, time)
         there, back, _ = predict_state(model, params, state, time, measurement.time)
         noise = jnp.asarray(model.process_cov(params, measurement.time, time), cov.dtype)
         _, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
         seen = matmul(H, back)
         spread = R + matmul(matmul(seen, noise), seen.T)
-        after = _informed(moved, _precision(seen, spread, measurement.mask))
+        after = _informed_bound(moved, _measured_information(seen, spread, measurement.mask))
         return (after, state[None], time), after
 
     return lax.scan(body, first, (stream, truth, times))[1]
 
 
-def _moved(model: Model, params: Params, cov: Array, states: Array, t0: Array, t1: Array) -> Array:
+def _moved_bound(
+    model: Model, params: Params, cov: Array, states: Array, t0: Array, t1: Array
+) -> Array:
     """The bound after the motion of the true states (R, n) from t0 to t1.
 
     With F = E[F] + dF, the inverse of (64) is Q + E[F] (J + E[dF' Q^-1 dF])^-1 E[F]'.
@@ -248,29 +254,33 @@ def _moved(model: Model, params: Params, cov: Array, states: Array, t0: Array, t
     mean = F.mean(0)
     root = cholesky.factor(Q)
     apart = jax.vmap(lambda F: cholesky.forward(root, F - mean))(F)
-    kept = _informed(cov, jnp.einsum("rij,rik->jk", apart, apart) / F.shape[0])
+    kept = _informed_bound(cov, jnp.einsum("rij,rik->jk", apart, apart) / F.shape[0])
     return matmul(matmul(mean, kept), mean.T) + Q
 
 
-def _information(model: Model, params: Params, states: Array, measurement: Measurement) -> Array:
+def _expected_information(
+    model: Model, params: Params, states: Array, measurement: Measurement
+) -> Array:
     """E[H' R^-1 H] over the true states (R, n)."""
 
     def one_state(x: Array) -> Array:
         _, H, R = predict_measurement(model, params, x, measurement.sensor, measurement.time)
-        return _precision(H, R, measurement.mask)
+        return _measured_information(H, R, measurement.mask)
 
     return jax.vmap(one_state)(states).mean(0)
 
 
-def _precision(H: Array, R: Array, mask: Array) -> Array:
+def _measured_information(H: Array, R: Array, mask: Array) -> Array:
     """H' R^-1 H over the components that exist; NaN where R has no inverse."""
     root = cholesky.factor(gaussian.mask_cov(R, mask))
     white = cholesky.forward(root, jnp.where(mask[:, None], H, 0))
     return jnp.where(root.full_rank, matmul(white.T, white), jnp.nan)
 
 
-def _informed(cov: Array, information: Array) -> Array:
+def _informed_bound(cov: Array, information: Array) -> Array:
     """(cov^-1 + information)^-1, where both may be singular."""
+    # (P^-1 + L L')^-1 = P - P L (I + L' P L)^-1 L' P: neither P nor the information is inverted,
+    # and the matrix that is has eigenvalues of at least 1.
     root = cholesky.factor(information).lower
     cross = matmul(root.T, cov)
     eye = jnp.eye(cov.shape[0], dtype=cov.dtype)
@@ -279,7 +289,7 @@ def _informed(cov: Array, information: Array) -> Array:
     return cov - matmul(white.T, white)
 
 
-def _checked(
+def _checked_inputs(
     model: Model,
     params: Params,
     measurements: Measurement,

@@ -32,6 +32,8 @@ def dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
     implicit function theorem, so they do not depend on the iteration. Q may be singular; R is
     positive definite.
     """
+    # The unknown is the upper triangle: half as many numbers in the linear system of the
+    # derivative.
     rows, cols = jnp.triu_indices(F.shape[0])
 
     def full(packed: Array) -> Array:
@@ -43,15 +45,17 @@ def dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
 
     def solve(_: object, guess: Array) -> Array:
         del guess
-        return _doubling(F, H, Q, R)[rows, cols]
+        return _doubled_solution(F, H, Q, R)[rows, cols]
 
+    # The defect is linear in the tangent, so its Jacobian is one small matrix (n (n + 1) / 2):
+    # solved directly, where an iteration would need a rate of its own.
     def tangent_solve(linear: object, y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)  # type: ignore[arg-type]
 
     return full(lax.custom_root(defect, Q[rows, cols], solve, tangent_solve))
 
 
-def _doubling(F: Array, H: Array, Q: Array, R: Array) -> Array:
+def _doubled_solution(F: Array, H: Array, Q: Array, R: Array) -> Array:
     eye = jnp.eye(F.shape[0], dtype=F.dtype)
     tolerance = 4 * F.shape[0] * float(jnp.finfo(F.dtype).eps)
 
@@ -61,6 +65,8 @@ def _doubling(F: Array, H: Array, Q: Array, R: Array) -> Array:
 
     def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         count, _, A, G, P = carry
+        # Structure-preserving doubling: A, G, P of 2^k steps give those of 2^(k+1) with one
+        # factorisation, A (I + G P)^-1 A and so on (Chu, Fan, Lin & Wang 2004, SDA).
         lu = jax.scipy.linalg.lu_factor(eye + G @ P)
         solved_A = jax.scipy.linalg.lu_solve(lu, A)
         G_next = G + A @ jax.scipy.linalg.lu_solve(lu, G) @ A.T

@@ -38,7 +38,7 @@ def stabilising_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
     def defect(P: Array) -> Array:
         return riccati_step(P, F, H, Q, R) - P
 
-    return _root(defect, guess, refined, Q)
+    return _refined_root(defect, guess, refined, Q)
 
 
 def strong_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
@@ -50,6 +50,8 @@ def strong_dare(F: Array, H: Array, Q: Array, R: Array) -> Array:
     least = dare(F, H, Q, R)
     left = F - F @ gain(least, H, R) @ H
     radius = jnp.max(jnp.abs(jnp.linalg.eigvals(lax.stop_gradient(left))))
+    # A double root of the Riccati equation is found to the square root of eps only: a mode on the
+    # unit circle may come out that far beyond it.
     settled = radius <= 1 + jnp.sqrt(jnp.finfo(F.dtype).eps)
 
     def follow(_: Array) -> Array:
@@ -104,7 +106,7 @@ def stabilising_care(F: Array, H: Array, Q: Array, R: Array) -> Array:
     G = H.T @ looking
 
     def guess(Q: Array) -> Array:
-        return dare(*_cayley(F, G, Q))
+        return dare(*_cayley_transform(F, G, Q))
 
     def refined(P: Array) -> Array:
         K = P @ looking.T
@@ -113,28 +115,30 @@ def stabilising_care(F: Array, H: Array, Q: Array, R: Array) -> Array:
     def defect(P: Array) -> Array:
         return F @ P + P @ F.T - P @ G @ P + Q
 
-    return _root(defect, guess, refined, Q)
+    return _refined_root(defect, guess, refined, Q)
 
 
 def discrete_lyapunov(A: Array, Q: Array) -> Array:
     """X (n, n) with X = A X A' + Q."""
-    return _linear(A, Q, jnp.eye(A.shape[0] ** 2, dtype=A.dtype) - jnp.kron(A, A))
+    return _linear_solution(A, Q, jnp.eye(A.shape[0] ** 2, dtype=A.dtype) - jnp.kron(A, A))
 
 
 def continuous_lyapunov(A: Array, Q: Array) -> Array:
     """X (n, n) with A X + X A' + Q = 0."""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
-    return _linear(A, Q, -jnp.kron(A, eye) - jnp.kron(eye, A))
+    return _linear_solution(A, Q, -jnp.kron(A, eye) - jnp.kron(eye, A))
 
 
-def _linear(A: Array, Q: Array, matrix: Array) -> Array:
+def _linear_solution(A: Array, Q: Array, matrix: Array) -> Array:
     X = jnp.linalg.solve(matrix, Q.reshape(-1)).reshape(A.shape)
     return (X + X.T) / 2
 
 
-def _cayley(F: Array, G: Array, Q: Array) -> tuple[Array, Array, Array, Array]:
+def _cayley_transform(F: Array, G: Array, Q: Array) -> tuple[Array, Array, Array, Array]:
     """The discrete problem (F, H, Q, R) with the same stabilising solution."""
     eye = jnp.eye(F.shape[0], dtype=F.dtype)
+    # Larger than every eigenvalue of the Hamiltonian matrix, so that none is at the pole of the
+    # transformation.
     size = jnp.linalg.norm(F) + jnp.sqrt(jnp.linalg.norm(G) * jnp.linalg.norm(Q))
     shift = 1.1 * size + jnp.finfo(F.dtype).tiny
     inner = jnp.linalg.inv(F.T - shift * eye)
@@ -145,7 +149,7 @@ def _cayley(F: Array, G: Array, Q: Array) -> tuple[Array, Array, Array, Array]:
     return eye + 2 * shift * outer, look, (noise + noise.T) / 2, eye
 
 
-def _root(
+def _refined_root(
     defect: Callable[[Array], Array],
     guess: Callable[[Array], Array],
     refined: Callable[[Array], Array],
@@ -164,6 +168,9 @@ def _root(
         return count + 1, jnp.max(jnp.abs(better - P)), better
 
     def solve(_: object, start: Array) -> Array:
+        # More noise in every direction drives every growing mode, so the guess is stabilising; from
+        # a stabilising guess Newton's method converges and every iterate stays so (Hewer 1971,
+        # Kleinman 1968).
         P = guess(start + (1 + jnp.max(jnp.abs(start))) * jnp.eye(Q.shape[0], dtype=Q.dtype))
         first = (jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, Q.dtype), P)
         return lax.while_loop(going, once, first)[2]

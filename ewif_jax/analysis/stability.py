@@ -40,14 +40,14 @@ def require_steady_state(F: Array, H: Array, Q: Array, *, on_edge: Edge) -> None
     for eigenvalue in np.linalg.eigvals(F_known):
         place = float(on_edge(np.asarray([eigenvalue]))[0])
         shifted = F_known - eigenvalue * np.eye(n)
-        seen = _rank(np.vstack([shifted, H_known]), tolerance)
+        seen = _numerical_rank(np.vstack([shifted, H_known]), tolerance)
         checks.require(
             place < -tolerance or seen == n,
             "H",
             "measurements that see every mode that does not decay (observability)",
             f"none of the mode with eigenvalue {eigenvalue:.6g}",
         )
-        driven = _rank(np.hstack([shifted, Q_known]), tolerance)
+        driven = _numerical_rank(np.hstack([shifted, Q_known]), tolerance)
         checks.require(
             abs(place) > tolerance or driven == n,
             "Q",
@@ -56,5 +56,5 @@ def require_steady_state(F: Array, H: Array, Q: Array, *, on_edge: Edge) -> None
         )
 
 
-def _rank(matrix: np.ndarray, tolerance: float) -> int:
+def _numerical_rank(matrix: np.ndarray, tolerance: float) -> int:
     return int(np.linalg.matrix_rank(matrix, tol=tolerance))

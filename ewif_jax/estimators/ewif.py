@@ -100,6 +100,8 @@ def ewif(
     def measure(
         params: Params, state: InformationState, measurement: Measurement
     ) -> tuple[InformationState, Info]:
+        # W of a late measurement at the state's time: its R counts 1 / W^2 as much (36). Nothing
+        # else is special about it, since without process noise a motion back is exact.
         faded = growing(params, measurement.time, state.time)
         return form.absorb(model, params, state, measurement, faded)
 

@@ -89,6 +89,8 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         base = base._replace(time=time)
         stamps = state.buffer.time
         near = jnp.abs(time - stamps) <= half
+        # What is outside of the window is masked and moved to the present: motion over the interval
+        # of an empty slot (from -inf) would be NaN, and its slope too.
         safe = state.buffer._replace(
             time=jnp.where(near, stamps, time), mask=state.buffer.mask & near[:, None]
         )
@@ -109,6 +111,8 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
     def measure(
         params: Params, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
+        # The oldest in validity time goes, not the first that came: a late measurement must not
+        # push out a newer one.
         oldest = jnp.argmin(state.buffer.time)
         buffer = jax.tree.map(lambda kept, new: kept.at[oldest].set(new), state.buffer, measurement)
         before = fit(params, state, state.time)

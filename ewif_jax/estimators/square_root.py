@@ -62,6 +62,9 @@ def square_root(model: Model) -> Estimator:
         seen = jnp.where(mask[:, None], H @ state.root, 0)
         noise = root_of(gaussian.mask_cov(R, mask))
         blank = jnp.zeros((n, m), R.dtype)
+        # The square of this array is [[S, H P], [P H', P]]: its triangular root has S^(1/2) in the
+        # corner, P H' S^(-T/2) below it, and the root of the updated P beside. P is never formed or
+        # subtracted.
         array = triangularise(jnp.block([[noise, seen], [blank, state.root]]))
         lower, crossed, root = array[:m, :m], array[m:, :m], array[m:, m:]
         diagonal = jnp.diag(lower)

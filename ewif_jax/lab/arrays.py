@@ -27,7 +27,7 @@ def to_frame(trace: Trace, names: Sequence[str] | None = None) -> pd.DataFrame:
     Raises:
         ValueError: what is no trace, or another number of names.
     """
-    names = _names(trace, names)
+    names = _state_names(trace, names)
     mean = np.asarray(trace.mean)
     cov = np.asarray(trace.cov)
     lead = mean.shape[:-1]
@@ -69,7 +69,7 @@ def to_xarray(found: Trace | Statistics | Tuned, names: Sequence[str] | None = N
     return _of_tuned(found)
 
 
-def _names(trace: Trace, names: Sequence[str] | None) -> list[str]:
+def _state_names(trace: Trace, names: Sequence[str] | None) -> list[str]:
     checks.require(isinstance(trace, Trace), "trace", "a Trace", type(trace).__name__)
     size = np.shape(trace.mean)[-1]
     found = [f"x{k}" for k in range(size)] if names is None else list(names)
@@ -78,7 +78,7 @@ def _names(trace: Trace, names: Sequence[str] | None) -> list[str]:
 
 
 def _of_trace(trace: Trace, names: Sequence[str] | None) -> xr.Dataset:
-    names = _names(trace, names)
+    names = _state_names(trace, names)
     info = trace.info
     lead = ("run", "step") if np.ndim(trace.mean) == 3 else ("step",)
 
@@ -94,14 +94,14 @@ def _of_trace(trace: Trace, names: Sequence[str] | None) -> xr.Dataset:
         "innovation_cov": over_steps(info.innovation_cov, "component", "other_component"),
         "log_likelihood": over_steps(info.log_likelihood),
         "delay": (*over_steps(info.delay), {"units": "s"}),
-        "status": (*over_steps(info.status), {"meaning": _meaning()}),
+        "status": (*over_steps(info.status), {"meaning": _status_meaning()}),
     }
     time = over_steps(trace.time)
     coords = {"time": (*time, {"units": "s"}), "state": names, "other_state": names}
     return xr.Dataset(variables, coords)
 
 
-def _meaning() -> str:
+def _status_meaning() -> str:
     return ", ".join(f"{status.value}: {status.name}" for status in Status)
 
 

@@ -96,19 +96,19 @@ def compare(
     design = designed(
         methods, scenario, over, metrics, limits, runs, most_runs, chunk, key, time, warm_up
     )
-    about = _about(design)
+    about = _about_design(design)
     # Of several processes of one program the first keeps the folder.
     if folder is None or not hosts.is_first():
-        return _filled(design, InMemory(), executor, devices, progress, about)
+        return _filled_store(design, InMemory(), executor, devices, progress, about)
     store = InFolder(folder, about)
     store.claim(_bytes_needed(design))
     try:
-        return _filled(design, store, executor, devices, progress, about)
+        return _filled_store(design, store, executor, devices, progress, about)
     finally:
         store.leave()
 
 
-def _filled(
+def _filled_store(
     design: Design,
     store: Store,
     executor: Executor | None,
@@ -176,11 +176,13 @@ def _until_enough(
                 added = paired_moments(arrays[f"score/{name}"])
                 earlier = found[unit.point].get(name)
                 found[unit.point][name] = added if earlier is None else combined(earlier, added)
-        going = [p for p in going if chunks[p] < design.chunks and not _enough(design, found[p])]
+        going = [
+            p for p in going if chunks[p] < design.chunks and not _precise_enough(design, found[p])
+        ]
     return chunks
 
 
-def _enough(design: Design, found: Mapping[str, PairedMoments]) -> bool:
+def _precise_enough(design: Design, found: Mapping[str, PairedMoments]) -> bool:
     """Whether all standard errors are small enough; what has none never will."""
     assert design.until is not None
     for name, moments in found.items():
@@ -192,7 +194,7 @@ def _enough(design: Design, found: Mapping[str, PairedMoments]) -> bool:
     return True
 
 
-def _about(design: Design) -> dict[str, Any]:
+def _about_design(design: Design) -> dict[str, Any]:
     """What decides the numbers, in words that a refusal can show."""
     key = design.key
     return {

@@ -110,8 +110,8 @@ def designed(
     checks.require(is_scenario, "scenario", expected, type(scenario).__name__)
     checks.require(key is not None, "key", "a PRNG key (jax.random.key(0))", None)
     checks.random_key(key)
-    axes = {name: _numbers(name, values) for name, values in (over or {}).items()}
-    count, until = _size(runs, most_runs)
+    axes = {name: _axis_numbers(name, values) for name, values in (over or {}).items()}
+    count, until = _run_count(runs, most_runs)
     metrics = dict(metrics or {"squared_error": squared_error})
     for name, score in metrics.items():
         checks.require(callable(score), f"metrics[{name!r}]", "a score (`ej.scores`)", repr(score))
@@ -123,7 +123,7 @@ def designed(
         checks.require(is_limits, f"limits[{name!r}]", "lab.Limits(converged=, lost=)", repr(found))
     if warm_up is not None:
         checks.at_least("warm_up", warm_up, 0.0)
-    simulation = _tried(scenario, axes, key)
+    simulation = _tried_scenario(scenario, axes, key)
     _check_axes(named, scenario, axes, key)
     steps, dtype = (
         simulation.measurements.value.shape[0],
@@ -157,7 +157,7 @@ def designed(
     )
 
 
-def _size(runs: int | str, most_runs: int | None) -> tuple[int, float | None]:
+def _run_count(runs: int | str, most_runs: int | None) -> tuple[int, float | None]:
     """How many runs, or at most; and the relative error at which it is enough."""
     if not isinstance(runs, str):
         checks.require(most_runs is None, "most_runs", 'None, unless runs="until 1 %"', most_runs)
@@ -173,7 +173,7 @@ def _size(runs: int | str, most_runs: int | None) -> tuple[int, float | None]:
     return checks.whole("most_runs", most_runs or MOST_RUNS, 2), share
 
 
-def _numbers(name: str, values: Numbers) -> tuple[float, ...]:
+def _axis_numbers(name: str, values: Numbers) -> tuple[float, ...]:
     where, expected = f"over[{name!r}]", "a list of different numbers"
     checks.require(isinstance(name, str), "over", "names of axes", repr(name))
     taken = name not in ("method", "run", "step", "status", "metric")
@@ -187,7 +187,9 @@ def _numbers(name: str, values: Numbers) -> tuple[float, ...]:
     return tuple(float(x) for x in array)
 
 
-def _tried(scenario: Scenario, axes: Mapping[str, Sequence[float]], key: Array) -> Simulation:
+def _tried_scenario(
+    scenario: Scenario, axes: Mapping[str, Sequence[float]], key: Array
+) -> Simulation:
     """The shapes of a run at the first point."""
     params = _first_params(scenario, axes)
     try:

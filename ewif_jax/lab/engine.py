@@ -163,13 +163,13 @@ def _as_they_come(
 
 def remote(job: bytes, unit: tuple[int, int]) -> Arrays:
     """A unit, in a worker."""
-    design, tuned, x64 = _unpacked(job)
+    design, tuned, x64 = _unpacked_job(job)
     with jax.enable_x64(x64):
         return compute_unit(design, tuned, Unit(*unit))
 
 
 @lru_cache(maxsize=2)
-def _unpacked(job: bytes) -> tuple[Design, Tuned, bool]:
+def _unpacked_job(job: bytes) -> tuple[Design, Tuned, bool]:
     """The design, unpacked once in each worker: what was compiled for it is used again."""
     import pickle
 

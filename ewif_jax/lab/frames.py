@@ -88,13 +88,13 @@ def from_frame(
     names = [value] if isinstance(value, str) else list(value or latlon or ())
     two = latlon is None or len(names) == 2
     checks.require(two, "latlon", "two columns, latitude and longitude", latlon)
-    values = np.column_stack([_numbers(frame, "value", name) for name in names])
-    stamps = _times(frame, "time", time)
-    arrived = stamps if arrival is None else _times(frame, "arrival", arrival)
+    values = np.column_stack([_column_numbers(frame, "value", name) for name in names])
+    stamps = _column_times(frame, "time", time)
+    arrived = stamps if arrival is None else _column_times(frame, "arrival", arrival)
     same = stamps.dtype.kind == arrived.dtype.kind
     checks.require(same, "arrival", f"a column like {time!r}", f"{arrived.dtype}")
-    sensor_of = _labels(frame, "sensor", sensor)
-    track_of = _labels(frame, "track", track)
+    sensor_of = _column_labels(frame, "sensor", sensor)
+    track_of = _column_labels(frame, "track", track)
     dropped: dict[str, int] = {}
     kept = np.ones(len(values), bool)
 
@@ -120,12 +120,12 @@ def from_frame(
     rows = np.flatnonzero(kept)
     rows = rows[np.argsort(arrived[rows], kind="stable")] if arrival is not None else rows
     first = stamps[rows[0]] if stamps.dtype.kind == "M" else None
-    seconds, late = (_seconds(x, rows, first, UNITS[unit]) for x in (stamps, arrived))
+    seconds, late = (_column_seconds(x, rows, first, UNITS[unit]) for x in (stamps, arrived))
     plane = None
     if latlon is not None:
         plane = tuple(float(x) for x in (values[rows[0]] if origin is None else origin))
         values = to_plane(values, np.asarray(plane))
-    codes, sensors = _codes(sensor_of[rows])
+    codes, sensors = _label_codes(sensor_of[rows])
     shared = {
         "first": None if first is None else first.astype("datetime64[ns]"),
         "sensors": sensors,
@@ -144,18 +144,20 @@ def from_frame(
     if track is None:
         return of_rows(np.arange(len(rows)))
     by_track = track_of[rows]
-    return {name: of_rows(np.flatnonzero(by_track == name)) for name in _sorted(set(by_track))}
+    return {
+        name: of_rows(np.flatnonzero(by_track == name)) for name in _sorted_names(set(by_track))
+    }
 
 
-def _column(frame: Any, argument: str, name: str) -> Any:
+def _frame_column(frame: Any, argument: str, name: str) -> Any:
     have = [str(x) for x in getattr(frame, "columns", frame)]
     expected = f"one of the columns {', '.join(have)}"
     checks.require(name in have, argument, expected, repr(name))
     return frame[name]
 
 
-def _numbers(frame: Any, argument: str, name: str) -> np.ndarray:
-    column = _column(frame, argument, name)
+def _column_numbers(frame: Any, argument: str, name: str) -> np.ndarray:
+    column = _frame_column(frame, argument, name)
     try:
         if hasattr(column, "astype") and hasattr(column, "isna"):  # pandas: NA has no float
             return column.astype("float64").to_numpy()
@@ -165,9 +167,9 @@ def _numbers(frame: Any, argument: str, name: str) -> np.ndarray:
         raise ValueError(f"{argument}: expected numbers in column {name!r}, got {error}") from error
 
 
-def _times(frame: Any, argument: str, name: str) -> np.ndarray:
+def _column_times(frame: Any, argument: str, name: str) -> np.ndarray:
     """Date-times in UTC, durations, or numbers."""
-    column = _column(frame, argument, name)
+    column = _frame_column(frame, argument, name)
     zone = getattr(column.dtype, "tz", None) if hasattr(column, "dtype") else None
     if zone is not None:
         column = column.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -178,7 +180,7 @@ def _times(frame: Any, argument: str, name: str) -> np.ndarray:
         strangers = [x for x in found if x is not None and not _is_nan(x)]
         if strangers and not isinstance(strangers[0], int | float):
             return _from_objects(argument, name, found)
-    return _numbers(frame, argument, name)
+    return _column_numbers(frame, argument, name)
 
 
 def _from_objects(argument: str, name: str, found: np.ndarray) -> np.ndarray:
@@ -193,10 +195,10 @@ def _from_objects(argument: str, name: str, found: np.ndarray) -> np.ndarray:
     return whole.astype(f"{whole.dtype.kind}8[ns]")
 
 
-def _labels(frame: Any, argument: str, name: str | None) -> np.ndarray:
+def _column_labels(frame: Any, argument: str, name: str | None) -> np.ndarray:
     if name is None:
         return np.zeros(len(frame), int)
-    column = _column(frame, argument, name)
+    column = _frame_column(frame, argument, name)
     return np.asarray(column.to_numpy() if hasattr(column, "to_numpy") else column)
 
 
@@ -218,20 +220,20 @@ def _is_nan(x: Any) -> bool:
         return True
 
 
-def _seconds(x: np.ndarray, rows: np.ndarray, first: Any, unit: float) -> np.ndarray:
+def _column_seconds(x: np.ndarray, rows: np.ndarray, first: Any, unit: float) -> np.ndarray:
     some = x[rows]
     if some.dtype.kind == "M":
         some = some - first
     return some / np.timedelta64(1, "s") if some.dtype.kind == "m" else some * unit
 
 
-def _codes(labels: np.ndarray) -> tuple[np.ndarray, tuple[Any, ...]]:
-    names = _sorted(set(labels.tolist()))
+def _label_codes(labels: np.ndarray) -> tuple[np.ndarray, tuple[Any, ...]]:
+    names = _sorted_names(set(labels.tolist()))
     places = {name: k for k, name in enumerate(names)}
     return np.asarray([places[x] for x in labels.tolist()], np.int32), tuple(names)
 
 
-def _sorted(names: set[Any]) -> list[Any]:
+def _sorted_names(names: set[Any]) -> list[Any]:
     try:
         return sorted(names)
     except TypeError:  # of several kinds

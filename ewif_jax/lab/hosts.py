@@ -38,22 +38,22 @@ def share_units(
     kept = np.asarray(multihost_utils.broadcast_one_to_all(kept))
     for unit in (u for u, is_kept in zip(units, kept, strict=True) if is_kept):
         own = store.read(unit.name) if is_first() else None
-        found = next(iter(_exchanged(own)))
+        found = next(iter(_exchanged_bytes(own)))
         if not is_first():
-            done(unit, _decoded(found))
+            done(unit, _decoded_arrays(found))
     left = [u for u, is_kept in zip(units, kept, strict=True) if not is_kept]
     count = jax.process_count()
     for begin in range(0, len(left), count):
         group = left[begin : begin + count]
         place = jax.process_index()
         own = compute(group[place]) if place < len(group) else None
-        for unit, found in zip(group, _exchanged(own), strict=False):
-            done(unit, _decoded(found))
+        for unit, found in zip(group, _exchanged_bytes(own), strict=False):
+            done(unit, _decoded_arrays(found))
 
 
-def _exchanged(own: Arrays | None) -> Iterable[bytes]:
+def _exchanged_bytes(own: Arrays | None) -> Iterable[bytes]:
     """What each process sends, in their order."""
-    data = b"" if own is None else _encoded(own)
+    data = b"" if own is None else _encoded_arrays(own)
     sizes = np.ravel(multihost_utils.process_allgather(np.asarray([len(data)], np.int32)))
     padded = np.zeros(int(sizes.max()), np.uint8)
     padded[: len(data)] = np.frombuffer(data, np.uint8)
@@ -61,12 +61,12 @@ def _exchanged(own: Arrays | None) -> Iterable[bytes]:
     return [row[:size].tobytes() for row, size in zip(rows, sizes, strict=True)]
 
 
-def _encoded(arrays: Arrays) -> bytes:
+def _encoded_arrays(arrays: Arrays) -> bytes:
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)  # pyright: ignore[reportArgumentType]
     return buffer.getvalue()
 
 
-def _decoded(data: bytes) -> Arrays:
+def _decoded_arrays(data: bytes) -> Arrays:
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         return dict(stored)

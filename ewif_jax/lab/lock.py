@@ -29,7 +29,7 @@ def acquire(path: Path, *, wait: bool = False) -> None:
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            _lock(descriptor, wait)
+            _lock_file(descriptor, wait)
         except BlockingIOError:
             owner = os.read(descriptor, 20).decode("ascii", "replace").strip()
             os.close(descriptor)
@@ -55,7 +55,7 @@ def release(path: Path) -> None:
         os.close(descriptor)
 
 
-def _lock(descriptor: int, wait: bool) -> None:
+def _lock_file(descriptor: int, wait: bool) -> None:
     if fcntl is not None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 

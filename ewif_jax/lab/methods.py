@@ -52,7 +52,7 @@ class Told(NamedTuple):
     clock: Any
 
 
-class _Method(NamedTuple):
+class _MethodFields(NamedTuple):
     estimator: Estimator
     params: Params = None
     prior: Gaussian | FromScenario | None = SCENARIO
@@ -61,7 +61,7 @@ class _Method(NamedTuple):
     tune: Tuning | None = None
 
 
-class Method(_Method):
+class Method(_MethodFields):
     """One line of a comparison.
 
     estimator: any `Estimator`; params: its parameters, in which `axis(name)` stands for the number

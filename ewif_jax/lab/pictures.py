@@ -32,13 +32,13 @@ def grid_figure(
 ) -> Figure:
     """What `Comparison.plot` draws."""
     design = comparison.design
-    metric = _metric(comparison, metric)
+    metric = _chosen_metric(comparison, metric)
     comparison._require_method("reference", reference)
     if x is None:
         x = next(iter(design.axes), TIME)
     choices = [*design.axes, TIME]
     checks.require(x in choices, "x", f"one of {', '.join(choices)}", repr(x))
-    chosen = _points(comparison, at)
+    chosen = _point_numbers(comparison, at)
     panels: dict[tuple, list[int]] = {}
     for number in chosen:
         point = comparison.points[number]
@@ -61,7 +61,7 @@ def grid_figure(
         title = ", ".join(f"{name} = {value:g}" for name, value in others)
         is_left = ax in axes[:, 0]
         unit = "time [s]" if x == TIME else x
-        style.label(ax, unit, _name(comparison, metric, reference) if is_left else "", title)
+        style.label(ax, unit, _axis_label(comparison, metric, reference) if is_left else "", title)
     handles, names = axes[0, 0].get_legend_handles_labels()
     place = "outside upper left"
     figure.legend(handles, names, loc=place, ncols=min(len(names), 5), frameon=False)
@@ -78,7 +78,9 @@ def _against_axis(
 ) -> None:
     place = np.asarray([comparison.points[n][x] for n in numbers])
     order = np.argsort(place)
-    values, errors = zip(*(_values(comparison, n, metric, reference) for n in numbers), strict=True)
+    values, errors = zip(
+        *(_metric_values(comparison, n, metric, reference) for n in numbers), strict=True
+    )
     value, error = np.stack(values)[order], np.stack(errors)[order]
     for k, (name, look) in enumerate(style.looks(comparison.methods).items()):
         bars: dict[str, Any] = {"capsize": 2.5, "markersize": 4.5, "linewidth": 1.5}
@@ -116,12 +118,16 @@ def pareto_figure(
     at: Mapping[str, float] | None = None,
 ) -> Figure:
     """What `Comparison.pareto` draws."""
-    metric = _metric(comparison, metric)
+    metric = _chosen_metric(comparison, metric)
     costs = ("seconds", "numbers")
     checks.require(cost in costs, "cost", "'seconds' or 'numbers'", repr(cost))
-    number = _points(comparison, at)[0]
-    value, error = _values(comparison, number, metric, None)
-    spent = _seconds(comparison, number) if cost == "seconds" else _numbers(comparison, number)
+    number = _point_numbers(comparison, at)[0]
+    value, error = _metric_values(comparison, number, metric, None)
+    spent = (
+        _seconds_spent(comparison, number)
+        if cost == "seconds"
+        else _axis_numbers(comparison, number)
+    )
     figure, axes = style.canvas(width=7, height=4.5)
     ax = axes[0, 0]
     for k, (name, look) in enumerate(style.looks(comparison.methods).items()):
@@ -137,7 +143,7 @@ def pareto_figure(
     style.plain_log_ticks(ax)
     units = {"seconds": "seconds per arrival and run, filtering only", "numbers": "numbers stored"}
     point = ", ".join(f"{name} = {x:g}" for name, x in comparison.points[number].items())
-    style.label(ax, units[cost], _name(comparison, metric, None), point)
+    style.label(ax, units[cost], _axis_label(comparison, metric, None), point)
     return figure
 
 
@@ -152,7 +158,7 @@ def front(cost: np.ndarray, value: np.ndarray) -> np.ndarray:
     return np.asarray(kept, int)
 
 
-def _values(
+def _metric_values(
     comparison: "Comparison", number: int, metric: str, reference: str | None
 ) -> tuple[np.ndarray, np.ndarray]:
     found = comparison._moments[number][f"score/{metric}"]
@@ -162,7 +168,7 @@ def _values(
     return moments.differences(found, comparison.methods.index(reference), root)
 
 
-def _seconds(comparison: "Comparison", number: int) -> np.ndarray:
+def _seconds_spent(comparison: "Comparison", number: int) -> np.ndarray:
     cost = comparison.cost
     here = np.ones(len(cost), bool)
     for name, value in comparison.points[number].items():
@@ -170,7 +176,7 @@ def _seconds(comparison: "Comparison", number: int) -> np.ndarray:
     return cost["seconds_per_arrival"].to_numpy()[here]
 
 
-def _numbers(comparison: "Comparison", number: int) -> np.ndarray:
+def _axis_numbers(comparison: "Comparison", number: int) -> np.ndarray:
     found = []
     point = comparison.points[number]
     for name in comparison.methods:
@@ -181,13 +187,13 @@ def _numbers(comparison: "Comparison", number: int) -> np.ndarray:
     return np.asarray(found, float)
 
 
-def _metric(comparison: "Comparison", metric: str | None) -> str:
+def _chosen_metric(comparison: "Comparison", metric: str | None) -> str:
     names = list(comparison.design.metrics)
     checks.require(metric in (None, *names), "metric", f"one of {', '.join(names)}", repr(metric))
     return names[0] if metric is None else metric
 
 
-def _points(comparison: "Comparison", at: Mapping[str, float] | None) -> list[int]:
+def _point_numbers(comparison: "Comparison", at: Mapping[str, float] | None) -> list[int]:
     """Numbers of the points that `at` leaves."""
     axes = comparison.design.axes
     for name, value in (at or {}).items():
@@ -202,7 +208,7 @@ def _points(comparison: "Comparison", at: Mapping[str, float] | None) -> list[in
     ]
 
 
-def _name(comparison: "Comparison", metric: str, reference: str | None) -> str:
+def _axis_label(comparison: "Comparison", metric: str, reference: str | None) -> str:
     plain = metric.replace("_", " ")
     shown = f"RMSE, {plain}" if metric in comparison.design.roots else f"mean {plain}"
     if metric == "squared_error":

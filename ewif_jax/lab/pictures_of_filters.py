@@ -38,7 +38,7 @@ def track(
             of an EWIF is not that of its error.
         ax: to draw on.
     """
-    mean, cov = _single(trace)
+    mean, cov = _check_single(trace)
     ax = style.own_axes(ax, 6.5, 6.0)
     x, y = axes
     if measurements is not None:
@@ -94,7 +94,7 @@ def component(
         name: of the component, with its unit.
         ax: to draw on.
     """
-    mean, cov = _single(trace)
+    mean, cov = _check_single(trace)
     ax = style.own_axes(ax)
     time = np.asarray(trace.time)
     source = "covariance of the filter"
@@ -129,7 +129,7 @@ def component(
 def innovations(trace: Trace, *, level: float = 0.95, ax: Axes | None = None) -> Axes:
     """NIS of every used measurement against time, with the chi-square band that holds `level` of
     them if the filter is consistent, by how many components were measured."""
-    _single(trace)
+    _check_single(trace)
     ax = style.own_axes(ax)
     status = np.asarray(trace.info.status)
     used = (status == Status.USED) | (status == Status.LATE_USED)
@@ -228,7 +228,7 @@ def _nees_of(trace: Trace, truth: Numbers) -> tuple[np.ndarray, int]:
     return np.asarray(nees(trace.mean, trace.cov, true)), k
 
 
-def _single(trace: Trace) -> tuple[np.ndarray, np.ndarray]:
+def _check_single(trace: Trace) -> tuple[np.ndarray, np.ndarray]:
     one = isinstance(trace, Trace) and np.ndim(trace.mean) == 2
     checks.require(one, "trace", "the Trace of one series", type(trace).__name__)
     return np.asarray(trace.mean), np.asarray(trace.cov)

@@ -19,8 +19,8 @@ def history(tuned: Tuned, *, ax: Axes | None = None) -> Axes:
     """Every number of the parameters, step by step of the descent, relative to the best (which is
     1), and the loss relative to the best loss."""
     ax = style.own_axes(ax)
-    best = dict(_named(tuned.params))
-    found = _named(tuned.history["params"])
+    best = dict(_named_numbers(tuned.params))
+    found = _named_numbers(tuned.history["params"])
     looks = style.looks([name for name, _ in found])
     for name, path in found:
         flat = path.reshape(len(path), -1)
@@ -119,7 +119,7 @@ def merit_map(
     return ax
 
 
-def _named(params: Params) -> list[tuple[str, np.ndarray]]:
+def _named_numbers(params: Params) -> list[tuple[str, np.ndarray]]:
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return [
         (jax.tree_util.keystr(path, simple=True, separator=".") or "params", np.asarray(x))

@@ -26,9 +26,9 @@ def write_whole(path: Path, save: Callable[[Path], object]) -> None:
     half = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         save(half)
-        _flush(half)
+        _flush_to_disk(half)
         os.replace(half, path)
-        _flush(path.parent)
+        _flush_to_disk(path.parent)
     except BaseException as error:
         half.unlink(missing_ok=True)
         if isinstance(error, OSError):
@@ -71,7 +71,7 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _flush(path: Path) -> None:
+def _flush_to_disk(path: Path) -> None:
     """Puts a file, or the names in a folder, on the disk."""
     if path.is_dir() and os.name == "nt":
         return

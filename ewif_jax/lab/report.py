@@ -44,12 +44,14 @@ def page(comparison: "Comparison", reference: str, title: str) -> str:
     """The whole page."""
     title = title or "Comparison of " + ", ".join(comparison.methods)
     table = comparison.table(reference, details=True)
-    parts = [f"<h1>{escape(title)}</h1>", f"<p>{escape(tables._head(comparison))}</p>"]
+    parts = [f"<h1>{escape(title)}</h1>", f"<p>{escape(tables._table_head(comparison))}</p>"]
     for metric in comparison.design.metrics:
         own = table[table["metric"] == metric]
         heading = f"{metric.replace('_', ' ')}, against {reference} on the same runs"
         parts += [f"<h2>{escape(heading)}</h2>", sortable(own)]
-    parts += [f"<figure>{svg(figure)}</figure>" for figure in _figures(comparison, reference)]
+    parts += [
+        f"<figure>{svg(figure)}</figure>" for figure in _report_figures(comparison, reference)
+    ]
     if len(comparison.tuned):
         parts += ["<h2>Tuned parameters</h2>", _plain_table(comparison.tuned)]
     parts += ["<h2>Cost</h2>", _plain_table(comparison.cost)]
@@ -67,7 +69,7 @@ def page(comparison: "Comparison", reference: str, title: str) -> str:
     )
 
 
-def _figures(comparison: "Comparison", reference: str) -> list[Figure]:
+def _report_figures(comparison: "Comparison", reference: str) -> list[Figure]:
     found = []
     for metric in comparison.design.metrics:
         for x in comparison.design.axes:
@@ -93,12 +95,12 @@ def sortable(table: Any) -> str:
     """A table whose columns are sorted by a click, by their numbers."""
     seen = tables.for_people(table)
     raw = table.rename(columns=lambda c: c.replace("_", " "))
-    head = "".join(f"<th{_word(raw[c])}>{escape(c)}</th>" for c in seen.columns)
+    head = "".join(f"<th{_column_word(raw[c])}>{escape(c)}</th>" for c in seen.columns)
     rows = []
     for (_, cells), (_, numbers) in zip(seen.iterrows(), raw.iterrows(), strict=True):
         row = "".join(
-            f"<td{_word(raw[c])} data-sort='{escape(str(numbers[c]))}'>"
-            f"{escape(_cell(cells[c]))}</td>"
+            f"<td{_column_word(raw[c])} data-sort='{escape(str(numbers[c]))}'>"
+            f"{escape(_cell_text(cells[c]))}</td>"
             for c in seen.columns
         )
         rows.append(f"<tr>{row}</tr>")
@@ -107,11 +109,11 @@ def sortable(table: Any) -> str:
     return f"<div class='wide'>{whole}</div>"
 
 
-def _word(column: Any) -> str:
+def _column_word(column: Any) -> str:
     return " class='word'" if column.dtype.kind not in "iufb" and column.name == "method" else ""
 
 
-def _cell(x: object) -> str:
+def _cell_text(x: object) -> str:
     return f"{x:.4g}" if isinstance(x, float | np.floating) else str(x)
 
 
@@ -119,7 +121,7 @@ def _plain_table(frame: pd.DataFrame) -> str:
     head = "".join(f"<th>{escape(str(c).replace('_', ' '))}</th>" for c in frame.columns)
     rows = "".join(
         "<tr>"
-        + "".join(f"<td data-sort='{escape(str(x))}'>{escape(_cell(x))}</td>" for x in row)
+        + "".join(f"<td data-sort='{escape(str(x))}'>{escape(_cell_text(x))}</td>" for x in row)
         + "</tr>"
         for row in frame.itertuples(index=False)
     )

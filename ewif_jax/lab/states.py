@@ -25,8 +25,8 @@ def save_state(path: str | os.PathLike[str], state: State) -> Path:
         state: a pytree of arrays.
     """
     leaves = jax.tree.leaves(state)
-    arrays = {f"leaf{i}": _plain(x) for i, x in enumerate(leaves)}
-    about = {"format": FORMAT, "version": version("ewif_jax"), "state": _described(state)}
+    arrays = {f"leaf{i}": _plain_leaf(x) for i, x in enumerate(leaves)}
+    about = {"format": FORMAT, "version": version("ewif_jax"), "state": _described_leaves(state)}
     place = Path(path)
     write_piece(place, {**arrays, "about": np.asarray(json.dumps(about))})
     return place
@@ -51,7 +51,7 @@ def load_state(path: str | os.PathLike[str], like: State) -> Any:
     except (Broken, KeyError, ValueError) as error:
         raise ValueError(f"path: expected a file of save_state, got {path}") from error
     checks.require(about["format"] <= FORMAT, "path", f"format {FORMAT}", about["format"])
-    there, here = about["state"], _described(like)
+    there, here = about["state"], _described_leaves(like)
     for name in (*here, *(name for name in there if name not in here)):
         same = there.get(name) == here.get(name)
         got = f"{there.get(name, 'nothing')} in {path}"
@@ -61,17 +61,17 @@ def load_state(path: str | os.PathLike[str], like: State) -> Any:
     return jax.tree.unflatten(structure, found)
 
 
-def _described(state: State) -> dict[str, str]:
+def _described_leaves(state: State) -> dict[str, str]:
     """Shape and dtype of each leaf, by its name."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
-    return {jax.tree_util.keystr(path): f"{_dtype(x)}{list(np.shape(x))}" for path, x in leaves}
+    return {jax.tree_util.keystr(path): f"{_dtype_of(x)}{list(np.shape(x))}" for path, x in leaves}
 
 
-def _dtype(x: Numbers) -> str:
+def _dtype_of(x: Numbers) -> str:
     return str(jax.numpy.result_type(x)) if not checks.is_typed_key(x) else str(x.dtype)
 
 
-def _plain(x: Numbers) -> np.ndarray:
+def _plain_leaf(x: Numbers) -> np.ndarray:
     return np.asarray(jax.random.key_data(x) if checks.is_typed_key(x) else x)
 
 

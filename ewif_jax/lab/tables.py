@@ -60,7 +60,7 @@ def rows(
     if details:
         columns |= {"final": final, "final_error": final_error}
     if f"times/{metric}" in total:
-        columns |= _convergence(total[f"times/{metric}"], int(total["runs"]))
+        columns |= _convergence_rows(total[f"times/{metric}"], int(total["runs"]))
     if f"lost/{metric}" in total:
         columns |= {"lost": total[f"lost/{metric}"] / total["runs"]}
     columns |= {"without": total["without"] / total["runs"]}
@@ -77,7 +77,7 @@ def rows(
     ]
 
 
-def _convergence(sums: np.ndarray, runs: int) -> dict[str, np.ndarray]:
+def _convergence_rows(sums: np.ndarray, runs: int) -> dict[str, np.ndarray]:
     count, total, squares = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = total / count
@@ -94,12 +94,12 @@ def tuned_rows(
     for number, by_method in tuned.items():
         for name, params in by_method.items():
             leaves = jax.tree_util.tree_leaves_with_path(params)
-            own = {_path(path): np.asarray(x)[()] for path, x in leaves}
+            own = {_path_values(path): np.asarray(x)[()] for path, x in leaves}
             found.append({**points[number], "method": name, **own})
     return pd.DataFrame(found)
 
 
-def _path(path: Any) -> str:
+def _path_values(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".") or "params"
 
 
@@ -191,16 +191,16 @@ def for_people(table: pd.DataFrame) -> pd.DataFrame:
 def text(comparison: "Comparison", reference: str | None, details: bool) -> str:
     """The table as text, under a line that says what it is."""
     table = for_people(comparison.table(reference, details=details))
-    return f"{_head(comparison)}\n{table.to_string(index=False)}"
+    return f"{_table_head(comparison)}\n{table.to_string(index=False)}"
 
 
 def html(comparison: "Comparison") -> str:
     """The table for a notebook."""
     table = for_people(comparison.table())
-    return f"<p>{_head(comparison)}</p>{table.to_html(index=False)}"
+    return f"<p>{_table_head(comparison)}</p>{table.to_html(index=False)}"
 
 
-def _head(comparison: "Comparison") -> str:
+def _table_head(comparison: "Comparison") -> str:
     runs, metrics = comparison.runs, ", ".join(comparison.design.metrics)
     count = f"{runs[0]}" if len(set(runs)) == 1 else f"{min(runs)} to {max(runs)}"
     methods, points = len(comparison.methods), len(comparison.points)

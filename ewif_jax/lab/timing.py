@@ -19,18 +19,18 @@ class Timing:
 def timed() -> Iterator[Timing]:
     """Measures the block; the `Timing` is filled in when it ends. What the block computes should
     be on the host by then (JAX runs ahead of Python)."""
-    events = _compilations()
+    events = _compilation_spans()
     first, begin, timing = len(events), time.perf_counter(), Timing()
     try:
         yield timing
     finally:
         whole = time.perf_counter() - begin
-        timing.compile = min(_covered(events[first:]), whole)
+        timing.compile = min(_covered_length(events[first:]), whole)
         timing.run = whole - timing.compile
 
 
 @cache
-def _compilations() -> list[tuple[float, float]]:
+def _compilation_spans() -> list[tuple[float, float]]:
     """(begin, end) of everything JAX has compiled since the first call."""
     events: list[tuple[float, float]] = []
 
@@ -43,7 +43,7 @@ def _compilations() -> list[tuple[float, float]]:
     return events
 
 
-def _covered(intervals: list[tuple[float, float]]) -> float:
+def _covered_length(intervals: list[tuple[float, float]]) -> float:
     """Length of the union: tracing one function inside another is counted once."""
     total, reached = 0.0, -float("inf")
     for begin, end in sorted(intervals):

@@ -50,7 +50,7 @@ def computed(
     with timed() as simulating:
         simulation = simulate_batch(design.scenario, keys, design.world_at(point))
         simulation = jax.block_until_ready(simulation)
-    rows = _rows(simulation, design)
+    rows = _counted_rows(simulation, design)
     found: list[Arrays] = []
     for name, method in design.methods.items():
         params = tuned.get(name, lines.at_point(method.params, point))
@@ -59,7 +59,7 @@ def computed(
                 _one_method(design, name, params, simulation, own_keys, rows, real)
             )
         found.append({**part, "seconds": np.asarray(filtering.run)})
-    joined = {name: np.stack([_real(name, x[name], real) for x in found]) for name in found[0]}
+    joined = {name: np.stack([_real_runs(name, x[name], real) for x in found]) for name in found[0]}
     times = simulation.measurements.time if simulation.times is None else simulation.times
     times = np.asarray(times, float)
     times = np.maximum.accumulate(times, axis=-1)
@@ -77,13 +77,13 @@ STEP_SUMS = ("count", "mean", "apart", "squares")
 SUMMED = ("missing", "status", "without")
 
 
-def _real(name: str, x: np.ndarray, real: int) -> np.ndarray:
+def _real_runs(name: str, x: np.ndarray, real: int) -> np.ndarray:
     """Without the repetitions that fill a chunk."""
     kind = name.split("/")[0]
     return x[:real] if kind in RUNWISE else x[:real].sum(0) if kind in SUMMED else x
 
 
-def _rows(simulation: Simulation, design: Design) -> Array:
+def _counted_rows(simulation: Simulation, design: Design) -> Array:
     """(T,) or (R, T), which rows count: the same for all methods."""
     stream = simulation.measurements
     if design.warm_up is not None:
@@ -120,14 +120,14 @@ def _one_method(
         times=simulation.times,
         clock=told.clock,
         key=keys,
-        observe=_observer(tuple(design.metrics.items())),
+        observe=_score_observer(tuple(design.metrics.items())),
         context=Seen(truth, jnp.asarray(stream.mask), over_steps),
         context_per_run=Seen(truth.ndim == 3, stream.mask.ndim == 3, False),
         devices=1,
     )
     times = stream.time if simulation.times is None else simulation.times
     limits = tuple((name, x.converged, x.lost) for name, x in design.limits.items())
-    return _reduced(
+    return _reduced_scores(
         seen, rows, jnp.asarray(times), design.scenario.t0, real, limits, design.over_time
     )
 
@@ -145,7 +145,7 @@ def _stand_in(design: Design, size: int, dtype: DTypeLike) -> Gaussian:
 
 
 @cache
-def _observer(metrics: tuple[tuple[str, Score], ...]) -> Observer:
+def _score_observer(metrics: tuple[tuple[str, Score], ...]) -> Observer:
     """Scores by name, what became of the measurement, and whether there was an estimate; one
     object for equal metrics, so that nothing is compiled again."""
 
@@ -164,7 +164,7 @@ def _observer(metrics: tuple[tuple[str, Score], ...]) -> Observer:
 
 
 @partial(jax.jit, static_argnames=("limits", "over_time"))
-def _reduced(
+def _reduced_scores(
     seen: PyTree,
     rows: Array,
     times: Array,

@@ -73,7 +73,7 @@ def from_continuous(
         "both" if sensors is not None else "neither",
     )
     A, G, intensity, b = (
-        _given(argument, x)
+        _given_matrix(argument, x)
         for argument, x in (("A", A), ("G", G), ("intensity", intensity), ("b", b))
     )
     F_where = None
@@ -89,17 +89,17 @@ def from_continuous(
 
     def drift_over(params: Params, t0: Numbers, t1: Numbers) -> tuple[Array, Array]:
         """A (n, n) in the direction of time, and the length of the interval."""
-        drift, dt = _valued(A, params), domain.floating(t1) - domain.floating(t0)
+        drift, dt = _matrix_value(A, params), domain.floating(t1) - domain.floating(t0)
         checks.shape("A", drift, (drift.shape[0],) * 2)
         dtype = jnp.promote_types(drift.dtype, dt.dtype)
         drift, dt = drift.astype(dtype), dt.astype(dtype)
         return jnp.where(dt < 0, -drift, drift), jnp.where(dt < 0, -dt, dt)
 
     def noise_of(params: Params, dtype: DTypeLike) -> Array:
-        drive = _valued(G, params).astype(dtype)
+        drive = _matrix_value(G, params).astype(dtype)
         checks.shape("G", drive, ("n", "k"))
         k = drive.shape[1]
-        q = _squared_up(_valued(intensity, params), jnp).astype(dtype)
+        q = _squared_up(_matrix_value(intensity, params), jnp).astype(dtype)
         q = q if isinstance(intensity, np.ndarray) else domain.covariance("intensity", q)
         q = q * jnp.eye(k, dtype=dtype) if q.shape == (1, 1) else q
         checks.shape("intensity", q, (k, k))
@@ -114,7 +114,7 @@ def from_continuous(
 
     def gathered(params: Params, t0: Array, t1: Array) -> Array:
         drift, dt = drift_over(params, t0, t1)
-        push = _valued(b, params).astype(drift.dtype)
+        push = _matrix_value(b, params).astype(drift.dtype)
         checks.shape("b", push, drift.shape[:1])
         return integrated(drift, dt, push=jnp.where(t1 < t0, -push, push))[2]
 
@@ -128,7 +128,7 @@ def from_continuous(
             if callable(A):  # its size is known when it is asked
 
                 def H_of(params: Params, sensor: Array, t: Array) -> Array:
-                    size = jax.eval_shape(lambda: _valued(A, params)).shape[0]
+                    size = jax.eval_shape(lambda: _matrix_value(A, params)).shape[0]
                     return matrix(size)[0](params, sensor, t)
 
                 linear = Linear(F, offset, H_of)
@@ -186,12 +186,15 @@ def integrated(
     first = lax.scan(following, (starts, starts), numbers)[0][1]
 
     def doubled(stride: Stride, number: Array) -> tuple[Stride, None]:
-        twice = lax.cond(number < halvings, _twice, lambda x: x, stride)
+        twice = lax.cond(number < halvings, _doubled_stride, lambda x: x, stride)
         return twice, None
 
     def all_doubled(stride: Stride) -> Stride:
+        # A fixed number of rounds, most of which pass through: a `while` loop has no reverse
+        # derivative.
         return lax.scan(doubled, stride, jnp.arange(HALVINGS))[0]
 
+    # Short intervals, the usual ones, skip the rounds altogether.
     found = lax.cond(halvings > 0, all_doubled, lambda x: x, first)
     found = jax.tree.map(lambda x: jnp.where(enough, x, jnp.nan), found)
     return found.F, found.Q, found.b
@@ -202,11 +205,11 @@ def _both_sides(A: Array, x: Array) -> Array:
     return half + half.T
 
 
-def _twice(stride: Stride) -> Stride:
+def _doubled_stride(stride: Stride) -> Stride:
     return then(stride, stride, matmul, matvec)
 
 
-def _given(argument: str, value: Numbers) -> Any:
+def _given_matrix(argument: str, value: Numbers) -> Any:
     """An array of NumPy, or a function of `params`, or None; what is not finite is refused."""
     if value is None:
         return None
@@ -218,7 +221,7 @@ def _given(argument: str, value: Numbers) -> Any:
     return np.array(value, float)
 
 
-def _valued(value: Numbers, params: Params) -> Array:
+def _matrix_value(value: Numbers, params: Params) -> Array:
     """What it is for these parameters."""
     return domain.floating(value(params) if callable(value) else value)
 

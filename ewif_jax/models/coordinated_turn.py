@@ -72,7 +72,7 @@ def coordinated_turn(
         dt = t1 - t0
         half = x[4] * dt / 2
         s, c = jnp.sin(half), jnp.cos(half)
-        chord = dt * _sinc(half)
+        chord = dt * _sine_ratio(half)
         east, north = c * x[2] - s * x[3], s * x[2] + c * x[3]
         return jnp.stack(
             [
@@ -101,7 +101,7 @@ def coordinated_turn(
     return Model(transition, process_cov, observe, cov, residual, sensors=count, check=check)
 
 
-def _sinc(a: Array) -> Array:
+def _sine_ratio(a: Array) -> Array:
     """sin(a) / a: near 0 its series, so that derivatives lose no digits there."""
     near = jnp.abs(a) < 0.5
     square = jnp.square(jnp.where(near, a, 0))

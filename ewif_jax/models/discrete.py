@@ -28,7 +28,7 @@ def is_discrete(value: Numbers) -> bool:
 def constant(argument: str, value: Numbers, expected: tuple[int | str, ...]) -> Any:
     """A discrete F, Q or b as an array of NumPy or a function of `params`; what is refused, is."""
     if callable(value):
-        return partial(_read, named(one_program(value)))
+        return partial(_read_matrix, named(one_program(value)))
     if isinstance(value, Tracer):
         return lambda params: value
     checks.shape(argument, value, expected)
@@ -36,7 +36,7 @@ def constant(argument: str, value: Numbers, expected: tuple[int | str, ...]) -> 
     return np.array(value, float)
 
 
-def _read(value: Function, params: Params) -> Any:
+def _read_matrix(value: Function, params: Params) -> Any:
     return value(params)
 
 
@@ -50,6 +50,8 @@ def pattern_of_powers(F: Parameter) -> Pattern | None:
     if not isinstance(F, np.ndarray):
         return None
     n = F.shape[0]
+    # Of the graph of F with loops, walks of n steps reach whatever any number of steps reaches; the
+    # inverse is a polynomial in F (Cayley and Hamilton), so it has no other elements.
     return pattern(np.linalg.matrix_power((F != 0) + np.eye(n), n))
 
 
@@ -94,25 +96,25 @@ def transition_of_steps(F: Parameter, steps: Steps) -> Function:
         return _powers_of_constant(F, steps)
 
     def matrix(params: Params, t0: Array, t1: Array) -> Array:
-        first = _first("F", F, params, ("n", "n"))
+        first = _first_step("F", F, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
         # In a batch all branches run: nothing is inverted or multiplied up that is not asked for,
         # or its derivative would be infinity times 0.
         ahead, behind = chosen(k > 1, first, eye), chosen(k < 0, first, eye)
-        return _switch(
+        return _first_case(
             [
                 (k > 1, lambda: power(Stride(ahead), k, steps).F),
-                (k == -1, lambda: _inverse(behind)),
-                (k < -1, lambda: _back(behind, -k, steps)),
+                (k == -1, lambda: _inverse_motion(behind)),
+                (k < -1, lambda: _motion_back(behind, -k, steps)),
             ],
-            lambda: chosen(k > 0, first, _nothing(eye, whole)),
+            lambda: chosen(k > 0, first, _no_change(eye, whole)),
         )
 
     return matrix
 
 
-def _inverse(F: Array) -> Array:
+def _inverse_motion(F: Array) -> Array:
     """F^-1 (n, n), NaN where F is singular to rounding: the inverse is then some large numbers."""
     inverse = jnp.linalg.inv(F)
     size, size_back = (jnp.max(jnp.sum(jnp.abs(x), 1)) for x in (F, inverse))
@@ -120,9 +122,9 @@ def _inverse(F: Array) -> Array:
     return jnp.where(good, inverse, jnp.nan)
 
 
-def _back(F: Array, k: Array, steps: Steps) -> Array:
+def _motion_back(F: Array, k: Array, steps: Steps) -> Array:
     """F^-k (n, n): NaN where F is singular, infinite where it only grows too large."""
-    inverse = _inverse(F)
+    inverse = _inverse_motion(F)
     far = power(Stride(inverse), k, steps).F
     usable = jnp.all(jnp.isfinite(far)) | jnp.any(jnp.isnan(inverse))
     return jnp.where(usable, far, jnp.inf)
@@ -135,18 +137,18 @@ def input_of_steps(F: Parameter, b: Parameter, steps: Steps) -> Function:
     squares = squares_of(F, steps)
 
     def gathered(params: Params, t0: Array, t1: Array) -> Array:
-        first = _first("b", b, params, ("n",))
+        first = _first_step("b", b, params, ("n",))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
             if tables:
                 return looked_up(tables, k).b
-            one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), b=first)
+            one = Stride(_first_step("F", F, params, ("n", "n")).astype(first.dtype), b=first)
             return power(one, k, steps, squares).b
 
-        return _switch(
+        return _first_case(
             [(k > 1, many)],
-            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+            lambda: chosen(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
         )
 
     return gathered
@@ -159,18 +161,18 @@ def noise_of_steps(F: Parameter, Q: Parameter, steps: Steps) -> Function:
     squares = squares_of(F, steps)
 
     def summed(params: Params, t0: Array, t1: Array) -> Array:
-        first = _first("Q", Q, params, ("n", "n"))
+        first = _first_step("Q", Q, params, ("n", "n"))
         k, whole = count_steps(steps, t0, t1)
 
         def many() -> Array:
             if tables:
                 return looked_up(tables, k).Q
-            one = Stride(_first("F", F, params, ("n", "n")).astype(first.dtype), Q=first)
+            one = Stride(_first_step("F", F, params, ("n", "n")).astype(first.dtype), Q=first)
             return power(one, k, steps, squares).Q
 
-        return _switch(
+        return _first_case(
             [(k > 1, many)],
-            lambda: chosen(k > 0, first, _nothing(jnp.zeros_like(first), whole)),
+            lambda: chosen(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
         )
 
     return summed
@@ -191,32 +193,36 @@ def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
 
         def single() -> Array:
             step = chosen(k < 0, array(back), array(F))
-            return chosen(k == 0, _nothing(jnp.eye(F.shape[0]), whole), step)
+            return chosen(k == 0, _no_change(jnp.eye(F.shape[0]), whole), step)
 
-        return _switch([(abs(k) > 1, lambda: looked_up(tables, k).F)], single)
+        return _first_case([(abs(k) > 1, lambda: looked_up(tables, k).F)], single)
 
     return matrix
 
 
-def _nothing(still: Array, whole: Numbers) -> Array:
+def _no_change(still: Array, whole: Numbers) -> Array:
     """What no step does; NaN where the steps are not whole."""
     return chosen(whole, still, jnp.full_like(still, jnp.nan))
 
 
-def _first(argument: str, value: Numbers, params: Params, expected: tuple[int | str, ...]) -> Array:
+def _first_step(
+    argument: str, value: Numbers, params: Params, expected: tuple[int | str, ...]
+) -> Array:
     """What a discrete F, Q or b is for one step."""
     made = array(value(params) if callable(value) else value)
     checks.shape(argument, made, expected)
     return made if jnp.issubdtype(made.dtype, jnp.floating) else made.astype(float)
 
 
-def _switch(
+def _first_case(
     cases: list[tuple[Array, Callable[[], Array]]], otherwise: Callable[[], Array]
 ) -> Array:
     """The value of the first case whose condition holds, else `otherwise`; only that is computed,
     unless the conditions differ in a batch."""
     if all(checks.concrete_value(condition) is not None for condition, _ in cases):
         return next((make for condition, make in cases if condition), otherwise)()
+    # One `switch` and not nested `where`s: with times that a batch shares only the branch that is
+    # asked for runs; equal steps (k = 1) then cost what a constant F costs.
     index = jnp.zeros((), jnp.int32)
     for number, (condition, _) in enumerate(cases, 1):
         index = jnp.where(condition, jnp.int32(number), index)

@@ -30,7 +30,7 @@ def random_walk(
     *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, dims: int = 1, b: Parameter = None
 ) -> Model:
     r"""Position driven by white noise: :math:`Q = q\,\Delta t`, q in m^2/s."""
-    return _kinematic(0, sensors, q, dims, "white", b)
+    return _kinematic_model(0, sensors, q, dims, "white", b)
 
 
 @from_recipe
@@ -55,7 +55,7 @@ def constant_velocity(
         noise: which of the two.
         b: known input, function (params, t0, t1) -> (n,) for t1 >= t0.
     """
-    return _kinematic(1, sensors, q, dims, noise, b)
+    return _kinematic_model(1, sensors, q, dims, noise, b)
 
 
 @from_recipe
@@ -69,10 +69,10 @@ def constant_acceleration(
 ) -> Model:
     """Nearly constant acceleration; arguments as in `constant_velocity`, one derivative higher
     (q is the density of white jerk in m^2/s^5, or the variance of a constant jerk)."""
-    return _kinematic(2, sensors, q, dims, noise, b)
+    return _kinematic_model(2, sensors, q, dims, noise, b)
 
 
-def _kinematic(
+def _kinematic_model(
     order: int,
     sensors: Sensor | Sequence[Sensor],
     q: Parameter,
@@ -87,14 +87,14 @@ def _kinematic(
     n = (order + 1) * dims
     observe, cov, residual, matrix, count = bank(sensors)
     check_seen = domain.check_covariances(None, cov)
-    motion, spread, F_where = _matrices(order, dims, noise)
+    motion, spread, F_where = _motion_matrices(order, dims, noise)
 
     def F(params: Params, t0: Array, t1: Array) -> Array:
         del params
-        return motion(_interval(t0, t1))
+        return motion(_interval_of(t0, t1))
 
     def process_cov(params: Params, t0: Array, t1: Array) -> Array:
-        return domain.scaled(domain.variance("q", q, params), spread(_interval(t0, t1)))
+        return domain.scaled(domain.variance("q", q, params), spread(_interval_of(t0, t1)))
 
     def check(params: Params, t0: Numbers, t1: Numbers, sensors: Numbers) -> None:
         if t1 > t0:
@@ -119,21 +119,21 @@ def _kinematic(
     )
 
 
-def _interval(t0: Numbers, t1: Numbers) -> Array:
+def _interval_of(t0: Numbers, t1: Numbers) -> Array:
     dt = jnp.asarray(t1) - t0
     return dt.astype(jnp.result_type(dt, 0.0))
 
 
 @cache
-def _matrices(order: int, dims: int, noise: str) -> tuple[Function, Function, Pattern]:
+def _motion_matrices(order: int, dims: int, noise: str) -> tuple[Function, Function, Pattern]:
     """dt () -> F and Q / q (n, n), and where F may differ from zero."""
-    coefficient, power = _motion(order)
-    motion = _monomials(coefficient, power, dims)
-    noise_terms = _white(order) if noise == "white" else _held(order)
-    return motion, _monomials(*noise_terms, dims), pattern(np.kron(coefficient, np.eye(dims)))
+    coefficient, power = _motion_terms(order)
+    motion = _monomial_matrix(coefficient, power, dims)
+    noise_terms = _white_terms(order) if noise == "white" else _held_terms(order)
+    return motion, _monomial_matrix(*noise_terms, dims), pattern(np.kron(coefficient, np.eye(dims)))
 
 
-def _monomials(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Function:
+def _monomial_matrix(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Function:
     """dt () -> coefficient dt^power, element by element, the same in every dimension."""
     coefficient = np.kron(coefficient, np.eye(dims))
     # JAX keeps what it made of an index array, so it must not be made anew when x64 is switched.
@@ -149,24 +149,24 @@ def _monomials(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Functio
     return kernel(matrix, cheap=True)
 
 
-def _motion(order: int) -> tuple[np.ndarray, np.ndarray]:
+def _motion_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients and powers (order + 1, order + 1) of F: dt^(j - i) / (j - i)!."""
     i, j = np.indices((order + 1, order + 1))
     power = np.maximum(j - i, 0)
-    return np.where(j >= i, 1 / _factorial(power), 0), power
+    return np.where(j >= i, 1 / _factorials(power), 0), power
 
 
-def _white(order: int) -> tuple[np.ndarray, np.ndarray]:
+def _white_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of white noise on the highest derivative: integral of the propagated noise."""
     a, c = order - np.indices((order + 1, order + 1))
-    return 1 / (_factorial(a) * _factorial(c) * (a + c + 1)), a + c + 1
+    return 1 / (_factorials(a) * _factorials(c) * (a + c + 1)), a + c + 1
 
 
-def _held(order: int) -> tuple[np.ndarray, np.ndarray]:
+def _held_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of the next derivative held constant over the interval (DWNA for order 1)."""
     a, c = order + 1 - np.indices((order + 1, order + 1))
-    return 1 / (_factorial(a) * _factorial(c)), a + c
+    return 1 / (_factorials(a) * _factorials(c)), a + c
 
 
-def _factorial(x: np.ndarray) -> np.ndarray:
+def _factorials(x: np.ndarray) -> np.ndarray:
     return np.vectorize(factorial)(x)

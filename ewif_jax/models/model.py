@@ -44,7 +44,7 @@ class Linear(NamedTuple):
     reversible: bool = True
 
 
-class _Model(NamedTuple):
+class _ModelFields(NamedTuple):
     transition: Callable[..., Array]
     process_cov: Callable[..., Array]
     observe: Callable[..., Array]
@@ -57,7 +57,7 @@ class _Model(NamedTuple):
     returns_well: bool = False
 
 
-class Model(FromRecipe, _Model):
+class Model(FromRecipe, _ModelFields):
     """How a state moves and what the sensors see; pure functions, intervals always explicit.
 
     transition(params, x, t0, t1) -> (n,); t1 < t0 asks for the reversed motion

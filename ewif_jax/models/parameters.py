@@ -19,7 +19,7 @@ def resolve(value: Numbers, params: Params) -> Any:
 def named(value: Numbers) -> Any:
     """A function of (params, ...) that says which name it asked for and `params` has not; anything
     else as it is."""
-    return _named(value) if callable(value) else value
+    return _is_named(value) if callable(value) else value
 
 
 def of_params(value: Numbers) -> bool:
@@ -38,7 +38,7 @@ def of_params(value: Numbers) -> bool:
     return sum(one.kind in positional for one in found) == 1
 
 
-def _named(value: Callable[..., Any]) -> Callable[..., Any]:
+def _is_named(value: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(value)
     def call(params: Params, *args: Any) -> Any:
         try:
@@ -47,21 +47,21 @@ def _named(value: Callable[..., Any]) -> Callable[..., Any]:
             if not isinstance(params, Mapping):
                 raise
             raise ValueError(
-                f"params: expected the name {error}, which {_name(value)} reads, got "
-                f"{_names(params)}"
+                f"params: expected the name {error}, which {_name_of(value)} reads, got "
+                f"{_names_in(params)}"
             ) from error
         except TypeError as error:
             if params is not None or "NoneType" not in str(error):
                 raise
-            raise ValueError(f"params: expected what {_name(value)} reads, got None") from error
+            raise ValueError(f"params: expected what {_name_of(value)} reads, got None") from error
 
     return call
 
 
-def _name(value: Numbers) -> str:
+def _name_of(value: Numbers) -> str:
     return getattr(value, "__name__", "a function").replace("<lambda>", "a lambda of the model")
 
 
-def _names(params: Params) -> str:
+def _names_in(params: Params) -> str:
     paths = [path for path, _ in jax.tree.leaves_with_path(params)]
     return ", ".join(jax.tree_util.keystr(path) for path in paths) or "nothing"

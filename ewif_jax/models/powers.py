@@ -52,17 +52,19 @@ def looked_up(tables: list[Stride], k: Numbers) -> Stride:
     k < 0 too. What was not asked for is left out."""
     total = None
     for number, table in enumerate(tables):
+        # k in digits of base 32: each table holds what a digit of its place does, so k steps are
+        # one entry of each, composed.
         row = (abs(k) >> (BITS * number)) % 2**BITS
         if len(table.F) > 2**BITS:
             row = row + 2**BITS * (k < 0)
-        entry = jax.tree.map(lambda x, row=row: _row(array(x), row), table)
+        entry = jax.tree.map(lambda x, row=row: _table_row(array(x), row), table)
         total = entry if total is None else then(total, entry, matmul, matvec)
         total = total._replace(F=total.F if table.b is None and table.Q is None else None)
     assert total is not None
     return total
 
 
-def _row(table: Array, number: Numbers) -> Array:
+def _table_row(table: Array, number: Numbers) -> Array:
     return lax.dynamic_index_in_dim(table, number, keepdims=False)
 
 
@@ -96,6 +98,8 @@ def power(one: Stride, k: Numbers, steps: Steps, squares: np.ndarray | None = No
             square = square._replace(F=None)
         return (then(total, here, matmul, matvec), square), None
 
+    # Squares of an F that is an array are known in float64: repeated squaring in float32 would
+    # double the relative error at every digit.
     table = None if squares is None else array(squares, one.F.dtype)
     carry = total, one if table is None else one._replace(F=None)
     count = checks.concrete_value(k)

@@ -30,7 +30,7 @@ def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: N
     checks.sensor("measurement.sensor", int(index), model.sensors)
     if model.sensors is None and index > 0:
         checks.require(
-            _inside(model, int(index), (params, None if model.linear else x, t)),
+            _inside_tables(model, int(index), (params, None if model.linear else x, t)),
             "measurement.sensor",
             "an index inside the tables that H and R (or observe and measurement_cov) look up",
             int(index),
@@ -46,17 +46,17 @@ def check_sensors(model: Model, params: Params, x: Numbers, measurements: Measur
         check_sensor(model, params, x, np.int32(indices.max()), time)
 
 
-def _inside(model: Model, index: int, inputs: tuple) -> bool:
+def _inside_tables(model: Model, index: int, inputs: tuple) -> bool:
     """Whether the model has what it looks up for this index, asked once: the answer depends on the
     sizes of tables, and on whole numbers that may be indices too."""
     functions = question_of(model.linear, model.observe, model.measurement_cov)
     leaves, tree = jax.tree.flatten(inputs)
     # Functions that are gone answer to no question, so they need not be kept.
-    question = _inside, functions, index, tree, *map(_size_or_index, leaves)
+    question = _inside_tables, functions, index, tree, *map(_size_or_index, leaves)
 
     def looks_inside() -> bool:
-        examples = jax.tree.map(_example, inputs)
-        return not _clamps(model, index, examples) or _clamps(model, 0, examples)
+        examples = jax.tree.map(_example_value, inputs)
+        return not _index_clamps(model, index, examples) or _index_clamps(model, 0, examples)
 
     return remembered(question, looks_inside)
 
@@ -68,7 +68,7 @@ def _size_or_index(x: Numbers) -> Any:
     return aval if whole_numbers is None else (aval, digest(whole_numbers))
 
 
-def _clamps(model: Model, index: int, inputs: tuple) -> bool:
+def _index_clamps(model: Model, index: int, inputs: tuple) -> bool:
     """Whether an index goes out of range in what the model sees, computed now even inside a trace.
 
     The checks are traced on their own first: they see nothing when traced in eager evaluation.
@@ -89,6 +89,6 @@ def _clamps(model: Model, index: int, inputs: tuple) -> bool:
     return jax.tree.unflatten(jax.tree.structure(shape), error).get() is not None
 
 
-def _example(x: Numbers) -> Any:
+def _example_value(x: Numbers) -> Any:
     """`x` itself, or ones where its value is not known yet."""
     return np.ones(x.shape, x.dtype) if isinstance(x, Tracer) else x

@@ -17,14 +17,14 @@ from ewif_jax.recipe import FromRecipe, from_recipe
 from ewif_jax.types import Parameter, Params
 
 
-class _Sensor(NamedTuple):
+class _SensorFields(NamedTuple):
     observe: Callable[..., Array]
     cov: Callable[..., Array]
     angle: tuple[bool, ...]
     matrix: Callable[[int], np.ndarray] | None = None
 
 
-class Sensor(FromRecipe, _Sensor):
+class Sensor(FromRecipe, _SensorFields):
     """One sensor: observe(params, x, t) -> (m,), cov(params, t) -> (m, m), which of its m
     components are angles, and matrix(n) -> (m, n) if it is linear."""
 
@@ -42,7 +42,7 @@ def position_sensor(r: Parameter, dims: int = 1) -> Sensor:
     def observe(params: Params, x: Array, t: Array) -> Array:
         return x[:dims]
 
-    return Sensor(observe, _covariance(r, dims), (False,) * dims, lambda n: np.eye(dims, n))
+    return Sensor(observe, _sensor_covariance(r, dims), (False,) * dims, lambda n: np.eye(dims, n))
 
 
 @from_recipe
@@ -64,7 +64,7 @@ def bearing_sensor(r: Parameter, position: Sequence[float] = (0.0, 0.0)) -> Sens
         here = (east == 0) & (north == 0)
         return jnp.arctan2(jnp.where(here, 0, north), jnp.where(here, 1, east))[None]
 
-    return Sensor(observe, _covariance(r, 1), (True,))
+    return Sensor(observe, _sensor_covariance(r, 1), (True,))
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -74,7 +74,7 @@ def wrap_angle(angle: Array) -> Array:
     return jnp.where(jnp.abs(wrapped) <= 4, wrapped, jnp.nan)
 
 
-def _covariance(r: Parameter, m: int) -> Callable[..., Array]:
+def _sensor_covariance(r: Parameter, m: int) -> Callable[..., Array]:
     if not callable(r):
         if np.ndim(r) == 2:
             checks.psd("r", r)

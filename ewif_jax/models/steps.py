@@ -72,27 +72,28 @@ def check_steps(
     larger = np.maximum(abs(stamps), abs(first))
     rounding = ROUNDINGS * float(jnp.finfo(dtype).eps) * larger
     lost = rounding > steps.dt / 4
-    _refuse(
+    _refuse_where(
         lost,
         f"{argument}: expected times at which {jnp.dtype(dtype).name} can count steps of "
-        f"dt = {steps.dt:g} s, got {_at(stamps, lost)}: subtract the first time, or use float64",
+        f"dt = {steps.dt:g} s, got {_bad_stamp(stamps, lost)}: subtract the first time, or use "
+        "float64",
     )
     number = np.round((stamps - first) / steps.dt)
     between = abs(stamps - first - number * steps.dt) > np.maximum(SHARE * steps.dt, rounding)
-    _refuse(
+    _refuse_where(
         between,
-        f"{argument}: expected whole steps of dt = {steps.dt:g} s from {_number(first)} on, since "
-        f"constants in linear_model are a model in discrete time, got {_at(stamps, between)}"
-        f"{_spacing(stamps, between)}. Give linear_model the step of its constants as dt=, or "
+        f"{argument}: expected whole steps of dt = {steps.dt:g} s from {_as_text(first)} on, since "
+        f"constants in linear_model are a model in discrete time, got {_bad_stamp(stamps, between)}"
+        f"{_gap_text(stamps, between)}. Give linear_model the step of its constants as dt=, or "
         "functions of (params, t0, t1): models.from_continuous makes them",
     )
     if in_order:
         before = np.concatenate([np.zeros_like(number[..., :1]), number[..., :-1]], -1)
         far = abs(number - np.maximum.accumulate(before, -1)) > steps.max_steps
-        _refuse(
+        _refuse_where(
             far,
             f"{argument}: expected at most max_steps = {steps.max_steps} steps of dt = "
-            f"{steps.dt:g} s at once, got {_at(stamps, far)}{_spacing(stamps, far)}. Give "
+            f"{steps.dt:g} s at once, got {_bad_stamp(stamps, far)}{_gap_text(stamps, far)}. Give "
             "linear_model a larger max_steps=",
         )
 
@@ -112,12 +113,12 @@ def check_interval(steps: Steps | None, argument: str, interval: Numbers) -> Non
     )
 
 
-def _refuse(bad: np.ndarray, message: str) -> None:
+def _refuse_where(bad: np.ndarray, message: str) -> None:
     if bad.any():
         raise ValueError(message)
 
 
-def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
+def _bad_stamp(stamps: np.ndarray, bad: np.ndarray) -> str:
     """The first bad stamp and its row."""
     if not bad.any():
         return ""
@@ -127,7 +128,7 @@ def _at(stamps: np.ndarray, bad: np.ndarray) -> str:
     return f"{stamps.ravel()[place]:.10g} at row {row}{run}"
 
 
-def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:
+def _gap_text(stamps: np.ndarray, bad: np.ndarray) -> str:
     """The interval before the first bad stamp, and the usual one."""
     if not bad.any() or np.shape(stamps)[stamps.ndim - 1] < 2:
         return ""
@@ -139,5 +140,5 @@ def _spacing(stamps: np.ndarray, bad: np.ndarray) -> str:
     return f" ({last}the median interval is {usual:.6g} s)"
 
 
-def _number(first: np.ndarray) -> str:
+def _as_text(first: np.ndarray) -> str:
     return f"t0 = {float(first):.10g}" if first.ndim == 0 else "the first time"

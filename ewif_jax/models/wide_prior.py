@@ -51,10 +51,10 @@ def check_prior_width(
             return True  # a look without a program of its own: most priors are far from the limit
         stamps = np.append(float(t0), times).astype(dtype)
         mean = jnp.asarray(prior.mean, dtype)
-        matrices = _matrices(model, params, mean, stamps[:-1], stamps[1:], sensors)
+        matrices = _matrices_along(model, params, mean, stamps[:-1], stamps[1:], sensors)
     if any(checks.concrete_value(x) is None for x in matrices):
         return True
-    share = _rounding(cov, [np.asarray(x, float) for x in matrices], eps)
+    share = _rounding_share(cov, [np.asarray(x, float) for x in matrices], eps)
     checks.require(
         share <= LIMIT,
         "prior.cov",
@@ -68,7 +68,7 @@ def check_prior_width(
 
 
 @partial(jax.jit, static_argnames="model")
-def _matrices(
+def _matrices_along(
     model: Model, params: Params, mean: Array, start: Array, end: Array, sensors: Array
 ) -> tuple[Array, ...]:
     """F, Q, H and R of each interval and the measurement after it, along the predicted mean."""
@@ -82,7 +82,7 @@ def _matrices(
     return jax.lax.scan(row, mean, (start, end, sensors))[1]
 
 
-def _rounding(cov: np.ndarray, rows: list[np.ndarray], eps: float) -> float:
+def _rounding_share(cov: np.ndarray, rows: list[np.ndarray], eps: float) -> float:
     """The largest share of a variance after an update that is what the covariance before it was
     rounded by: (I - K H) dP (I - K H)' with |dP_ij| = eps sqrt(P_ii P_jj)."""
     share = 0.0

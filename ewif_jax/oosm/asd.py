@@ -85,6 +85,8 @@ def asd(model: Model, lag: int) -> Estimator:
         mean, cov = prior.mean, symmetric.pack(prior.cov)
         still = jnp.eye(mean.shape[0], dtype=mean.dtype)
         noise = jax.eval_shape(lambda: jnp.asarray(model.measurement_cov(params, np.int32(0), t0)))
+        # Empty slots hold a measurement with H = 0 and unit noise at t0: it passes D, U and nu
+        # unchanged, so no slot has to be asked whether it is filled.
         one = jnp.eye(noise.shape[0], dtype=mean.dtype)
         none = jnp.zeros((noise.shape[0], mean.shape[0]), mean.dtype)
         first = window.Kept(t0, mean, cov, still, none, one, none.T, one, none[:, 0])
@@ -103,15 +105,19 @@ def asd(model: Model, lag: int) -> Estimator:
         params: Params, state: WindowState, measurement: Measurement
     ) -> tuple[WindowState, Info]:
         place = jnp.sum(state.kept.time <= measurement.time)
-        mean, cov, before, after = _split(model, params, state, measurement.time, place)
+        mean, cov, before, after = _split_at(model, params, state, measurement.time, place)
         first = jnp.arange(count) == place
 
+        # A nonlinear sensor is linearised at the smoothed mean: what the kept measurements after it
+        # pull on a state before them moves the estimate there by P times that force.
         linearised_at = mean
         if model.linear is None:
             linearised_at = mean + symmetric.times(cov, window.force(state.kept, first, after))
         seen = compared(model, params, linearised_at, measurement)
         (difference, H, R, mask), accepted = sound(model, cov, seen)
         H, R = jnp.where(mask[:, None], H, 0), gaussian.mask_cov(R, mask)
+        # The line through h at the smoothed mean, seen from the filter's own mean of that time:
+        # what passes the later measurements below is relative to the latter.
         difference = jnp.where(mask, difference + matvec(H, linearised_at - mean), 0)
 
         cross = symmetric.rows(H, cov).T
@@ -122,10 +128,14 @@ def asd(model: Model, lag: int) -> Estimator:
         size = gaussian.sizes(cov, H, R)
         whole = gaussian.innovate(nu, D.T, U + R, mask, size)
         if state.share is not None:
-            R = R + _excess(state.share) * jnp.where(mask[:, None] & mask[None, :], whole.cov, 0)
+            # A share g of an update is the update with S / g in place of S = U + R: so R grows by S
+            # (1/g - 1) (`recursions/partial_use.py`).
+            R = R + _excess_noise(state.share) * jnp.where(
+                mask[:, None] & mask[None, :], whole.cov, 0
+            )
         now = gaussian.update_from_afar(state.mean, state.cov, nu, D.T, U, R, mask, size)[:2]
         mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
-        weight, pull, gain = _solved(innovation)
+        weight, pull, gain = _solved_innovation(innovation)
         new = window.Kept(measurement.time, mean, cov, after, H, R, gain, weight, pull)
         mean, cov = choose(measurement.time < state.time, now, (mean, cov))
         used = jnp.any(mask)
@@ -147,7 +157,7 @@ def asd(model: Model, lag: int) -> Estimator:
     )
 
 
-def _split(
+def _split_at(
     model: Model, params: Params, state: WindowState, time: Array, place: Array
 ) -> tuple[Array, Array, Array, Array]:
     """The filter's estimate at `time` with what is kept until then, mean (n,) and cov (packed), F
@@ -157,6 +167,8 @@ def _split(
     here = index == jnp.maximum(place - 1, 0)
     start, mean, cov = (slots.picked(x, here) for x in kept[:3])
     end = jnp.where(place < count, slots.picked(kept.time, index == place), state.time)
+    # A time out of reach is masked later; clipped, it asks the model for no interval that it may
+    # not have.
     time = jnp.clip(time, start, state.time)
     mean, F, Q = predict_state(model, params, mean, start, time)
     cov = symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
@@ -166,15 +178,16 @@ def _split(
     return mean, cov, F, predict_state(model, params, mean, time, end)[1]
 
 
-def _solved(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:
+def _solved_innovation(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:
     """S^-1 (m, m), S^-1 nu (m,) and K (n, m)."""
     m = innovation.value.shape[0]
     eye = jnp.eye(m, dtype=innovation.value.dtype)
+    # One solve for all three: the factor is walked through once.
     right = jnp.concatenate([eye, innovation.value[:, None], innovation.cross], 1)
     ratio = cholesky.solve(innovation.factor, right)
     return ratio[:, :m], ratio[:, m], ratio[:, m + 1 :].T
 
 
-def _excess(share: Array) -> Array:
+def _excess_noise(share: Array) -> Array:
     """1 / g - 1, finite for g = 0."""
     return 1 / jnp.maximum(share, jnp.sqrt(jnp.finfo(share.dtype).tiny)) - 1

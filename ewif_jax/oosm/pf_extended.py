@@ -96,6 +96,8 @@ def pf_extended(
 
     def move(params: Params, state: PathState, time: Array) -> PathState:
         def go(old: PathState) -> PathState:
+            # Both tables, with the old time in front and without, are views of one that is
+            # resampled once.
             paths = jnp.concatenate([old.particles[None], old.past])
             new, paths = form.step_ahead(kind, params, old, time, paths)
             times = jnp.concatenate([old.time[None], old.past_times])
@@ -115,7 +117,7 @@ def pf_extended(
         def drawn_between(cloud: ParticleState) -> tuple[ParticleState, Array, Array]:
             cloud, order, key = form.ready_to_draw(kind, cloud, in_order)
             ends = state._replace(particles=cloud.particles)
-            return cloud, _between(model, params, ends, order, measurement.time, key), order
+            return cloud, _drawn_between(model, params, ends, order, measurement.time, key), order
 
         cloud, there, order = lax.cond(
             weighing.is_late(state, measurement),
@@ -137,12 +139,14 @@ def pf_extended(
     return estimator_from(recursion._replace(model=model))
 
 
-def _between(
+def _drawn_between(
     model: Model, params: Params, state: PathState, order: Array, time: Array, key: Array
 ) -> Array:
     """Draws of the states at `time` (n, N), given where each particle was before and after: those
     now are copies, in this `order` (N,), of those that the stored paths belong to."""
     times = jnp.concatenate([state.time[None], state.past_times])
+    # Times fall along the table, so the number of later ones is the index of the last one not
+    # later.
     newer = jnp.clip(jnp.sum(times > time), 1, state.past_times.shape[0])
     start, end = times[newer], times[newer - 1]
     before = state.past[newer - 1][:, order]

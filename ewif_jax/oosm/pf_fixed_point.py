@@ -117,7 +117,7 @@ def pf_fixed_point(
         if points is not None:
             transform(points, params, 2 * prior.mean.shape[0], t0.dtype)
         told = CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
-        m = _size(model, params, told)
+        m = _value_size(model, params, told)
         nothing = Measurement(
             t0, jnp.zeros(m, t0.dtype), jnp.zeros((), jnp.int32), jnp.zeros(m, bool)
         )
@@ -150,14 +150,14 @@ def pf_fixed_point(
         seen, key = lax.cond(is_late, smoothed, in_sequence, state)
         log_weights, info = weighing.weigh(state, seen, measurement, collapse)
         weighed = state._replace(log_weights=log_weights, key=key)
-        return _remembered(weighed, measurement), info
+        return _remembered_summary(weighed, measurement), info
 
     recursion = Recursion("pf_fixed_point", start, form.mover(kind), measure, form.estimate)
     recursion = recursion._replace(reach=within_lag, draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))
 
 
-def _size(model: Model, params: Params, at: CovarianceState) -> int:
+def _value_size(model: Model, params: Params, at: CovarianceState) -> int:
     """How many components a measurement has."""
     sensor = jnp.zeros((), jnp.int32)
     return jax.eval_shape(lambda: model.observe(params, at.mean, sensor, at.time)).shape[0]
@@ -188,7 +188,7 @@ def _look_through(
     return Seen(jnp.where(good, log_density, -jnp.inf), innovation, weighing.judged(cov, good))
 
 
-def _remembered(state: SummaryState, measurement: Measurement) -> SummaryState:
+def _remembered_summary(state: SummaryState, measurement: Measurement) -> SummaryState:
     """The state with its present mean and covariance in place of those of the same time, or, after
     an in-sequence measurement or at a new time, in front of them."""
     mean, cov = form.summary(state)

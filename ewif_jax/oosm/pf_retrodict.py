@@ -74,6 +74,8 @@ def pf_retrodict(
             state, _, key = form.ready_to_draw(kind, state)
             then = jnp.minimum(measurement.time, state.time)
             Q = jnp.asarray(model.process_cov(params, then, state.time), state.time.dtype)
+            # The noise comes off first and the motion after it, as (89) has them: x(k) = f(x(l)) +
+            # v.
             origin = state.particles - form.noise(key, Q, particles)
             return state, form.transported(model, params, origin, state.time, then)
 

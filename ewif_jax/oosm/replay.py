@@ -98,7 +98,9 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
             jax.eval_shape(lambda: estimator.update(params, state.current, measurement))
         shares = state.shares
         stored, share = (None, None) if shares is None else (shares[:-1], shares[-1])
-        sorted_in, place = _insert((state.buffer, stored), (_padded(measurement, width), share))
+        sorted_in, place = _inserted_in_order(
+            (state.buffer, stored), (_padded_measurement(measurement, width), share)
+        )
 
         def filtered(at: Numbers, entry: tuple[Measurement, Array | None]) -> tuple[Any, Info]:
             measured, share = entry
@@ -115,7 +117,11 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         infos = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
         total = jnp.sum(infos.log_likelihood).astype(state.evidence.dtype)
         info = jax.tree.map(lambda x: x[place], infos)
+        # The chain rule in order of arrival: log p(z | all that came) is the joint log likelihood
+        # with z minus the one without it. The sum of what `Info` reports is then the joint density
+        # of the stream, in whatever order it came.
         info = info._replace(log_likelihood=total - state.evidence)
+        # The oldest measurement moves into the base: its density leaves the buffer's joint one.
         evidence = total - infos.log_likelihood[0]
         buffer, stored = rest
         shares = None if stored is None else jnp.append(stored, jnp.ones_like(stored[:1]))
@@ -132,20 +138,22 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     return estimator_from(method._replace(model=estimator.model))
 
 
-def _padded(measurement: Measurement, width: int) -> Measurement:
+def _padded_measurement(measurement: Measurement, width: int) -> Measurement:
     room = (0, width - measurement.value.shape[0])
     return measurement._replace(
         value=jnp.pad(measurement.value, room), mask=jnp.pad(measurement.mask, room)
     )
 
 
-def _insert(
+def _inserted_in_order(
     buffer: tuple[Measurement, PyTree], new: tuple[Measurement, PyTree]
 ) -> tuple[Any, Array]:
     """The buffer with `new` after everything not newer, and its place."""
     times = buffer[0].time
     place = jnp.sum(times <= new[0].time)
     index = jnp.arange(times.shape[0] + 1)
+    # Shifted by index arithmetic, not by a sort: `place` counts ties as older, so that measurements
+    # of one time stay in order of arrival.
     source = jnp.where(index < place, index, index - 1)
 
     def inserted(table: Array, row: Array) -> Array:

@@ -75,30 +75,30 @@ def smoothed_back(
 ) -> tuple[Compared, bool]:
     """The measurement through the smoothed state of its time; it can always be used."""
     time = jnp.clip(measurement.time, start.time, state.time)
-    tie = _tied(model, params, state, start, time)
+    tie = _tied_state(model, params, state, start, time)
     seen = compared(model, params, tie.mean, measurement)
     R = seen.R + matmul(matmul(seen.H, symmetric.unpack(tie.cov)), seen.H.T)
     return seen._replace(H=matmul(seen.H, tie.A), R=R), True
 
 
-def _tied(
+def _tied_state(
     model: Model, params: Params, state: HistoryState, start: CovarianceState, time: Array
 ) -> Tie:
     """The state at `time`, between `start` and now, tied to the present one."""
 
     def tied_back(tie: Tie, slot: CovarianceState) -> tuple[Tie, None]:
-        return choose(slot.time > time, _behind(model, params, tie, slot), tie), None
+        return choose(slot.time > time, _one_step_behind(model, params, tie, slot), tie), None
 
     n = state.mean.shape[0]
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
     nearest, _ = lax.scan(tied_back, now, state.past)
     mean, F, Q = predict_state(model, params, start.mean, start.time, time)
     cov = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q)
-    tie = _behind(model, params, nearest, CovarianceState(time, mean, cov))
+    tie = _one_step_behind(model, params, nearest, CovarianceState(time, mean, cov))
     return choose(time < nearest.time, tie, nearest)
 
 
-def _behind(model: Model, params: Params, tie: Tie, slot: CovarianceState) -> Tie:
+def _one_step_behind(model: Model, params: Params, tie: Tie, slot: CovarianceState) -> Tie:
     """One smoothing step from `tie` to the estimate `slot` of an earlier time."""
     end = jnp.maximum(tie.time, slot.time)
     predicted, F, Q = predict_state(model, params, slot.mean, slot.time, end)
@@ -106,6 +106,8 @@ def _behind(model: Model, params: Params, tie: Tie, slot: CovarianceState) -> Ti
     cross = matmul(F, full)
     spread = matmul(cross, F.T) + Q
     G = cholesky.solved((spread + spread.T) / 2, cross).T
+    # Sarkka's form of (94) for the part that the present state does not explain: squares only, so
+    # that a singular Q or P costs nothing but a skipped pivot.
     rest = jnp.eye(G.shape[0], dtype=G.dtype) - matmul(G, F)
     cov = symmetric.congruence(G, tie.cov + symmetric.pack(Q))
     return Tie(

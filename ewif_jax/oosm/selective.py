@@ -85,6 +85,8 @@ def selective(estimator: Estimator, max_delay: Parameter, softness: Parameter = 
             fresh = (delay <= 0) | (delay < limit)
             return offered(estimator.update, params, state, measurement, fresh)
         width = checks.positive_number("softness", resolve(softness, params))
+        # In sequence exactly 1: the gate speaks of late data only, and a sigmoid of T_d / softness
+        # would take a part of every measurement.
         share = jnp.where(delay > 0, jax.nn.sigmoid((limit - delay) / width), 1)
         return partly(estimator, share.astype(state.time.dtype)).update(params, state, measurement)
 

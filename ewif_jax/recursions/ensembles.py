@@ -154,8 +154,8 @@ def transformed(members: Array, looked: Look) -> Array:
     r"""The mean moved by the gain times the innovation, the deviations by
     :math:`\bar K = P_{xz} L'^{-1} (L + G)^{-1}` with :math:`P_{zz} = L L',\; R = G G'`."""
     innovation = looked.innovation
-    # Deviations shrink by L (L + G)^-1 of their size in measurement space, the square root of what
-    # a Kalman filter leaves (Whitaker & Hamill 2002 for one component), and no noise is drawn.
+    # For one component deviations shrink by G / L, the root of R / (P_hh + R): what a Kalman filter
+    # leaves of the variance (Whitaker & Hamill 2002), without a draw of noise.
     lower = innovation.factor.lower + looked.noise
     diagonal = jnp.diag(lower)
     kept = diagonal > 0

@@ -78,8 +78,8 @@ def transport(
     variances = state.variances if fade is None else fade(state.variances)
     faded = state._replace(time=time, mean=mean, variances=variances)
     back, _ = affine_flow(model, params, time, state.time, dtype)
-    # Chains of integrators have an upper triangular F: T F^-1 stays unit upper triangular but for a
-    # scaling of its rows, and no orthogonalisation is needed (half the work of a step of `ewif`).
+    # Chains of integrators have an upper triangular F: T F^-1 is then a unit upper triangular
+    # matrix again but for a scaling of its rows, and nothing has to be made orthogonal.
     if noise is None and where is not None and equations.is_upper(where):
         rows, diagonal = equations.carried(faded.rows, back, where)
         there = faded._replace(

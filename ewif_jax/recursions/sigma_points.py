@@ -46,8 +46,8 @@ def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> 
     number = checks.concrete_value(spread)
     if number is not None:
         checks.require(number > 0, "ut_kappa", f"a number above -{n}, minus the states", ut_kappa)
-        # Weights of order n / spread, of both signs, multiply values whose differences are small:
-        # with ut_alpha = 1e-3 of the textbooks 1e6 times eps, which is everything in float32.
+        # Weights of order n / spread, of both signs, multiply values that are rounded by eps: with
+        # ut_alpha = 1e-3 of the textbooks a tenth of every value is rounding in float32.
         lost = float(jnp.finfo(dtype).eps) * n / float(number)
         checks.require(
             lost <= ROUNDING,

@@ -22,7 +22,7 @@ DELAY = (0.3, 2.5)
 def arbitrary_path(time: Numbers) -> Array:
     """Position (..., 2) in m at `time` (...) in seconds: smooth, with speeds from 4 to 10 m/s and
     turns to either side."""
-    grid, east, north = _path()
+    grid, east, north = _target_path()
     time = jnp.asarray(time)
     return jnp.stack([jnp.interp(time, grid, east), jnp.interp(time, grid, north)], -1)
 
@@ -64,7 +64,7 @@ def arbitrary_target(lag: float = 0.0, late_used: bool = True) -> Scenario:
         late_used: False masks sensor 1; its arrivals stay, so that all regimes report alike.
     """
     checks.at_least("lag", lag, 0.0)
-    prompt, late = _sampling(0.0), _sampling(np.pi)
+    prompt, late = _sampling_times(0.0), _sampling_times(np.pi)
     time = jnp.asarray(np.concatenate([prompt, late]))
     sensor = jnp.asarray(np.repeat([0, 1], [prompt.size, late.size]))
     seen, spread = arbitrary_path(time), jax.vmap(arbitrary_noise)(sensor, time)
@@ -84,7 +84,7 @@ def arbitrary_target(lag: float = 0.0, late_used: bool = True) -> Scenario:
     return Scenario(simulate, None, 0.0)
 
 
-def _sampling(phase: float) -> np.ndarray:
+def _sampling_times(phase: float) -> np.ndarray:
     """Times between 0 and `LENGTH` at intervals that swing from `FAST` to `SLOW`."""
     times = [0.0]
     while times[-1] < LENGTH:
@@ -93,7 +93,7 @@ def _sampling(phase: float) -> np.ndarray:
     return np.asarray(times[:-1])
 
 
-def _path() -> tuple[Array, Array, Array]:
+def _target_path() -> tuple[Array, Array, Array]:
     """A fine grid of times, and the position there by integrating speed and heading."""
     grid = jnp.linspace(0.0, LENGTH + DELAY[1], 6251)
     heading = 1.2 * jnp.sin(0.13 * grid) - 0.9 * jnp.sin(0.23 * grid + 1.0) + 0.04 * grid

@@ -57,7 +57,7 @@ def arrowhead(
     Truth is the position at the newest validity time that has arrived. The start is known.
     """
     checks.positive("r", r)
-    return _delayed(arrowhead_path, (r, r), dt, mean_delay, steps)
+    return _delayed_stream(arrowhead_path, (r, r), dt, mean_delay, steps)
 
 
 @from_recipe
@@ -110,10 +110,12 @@ def arrowhead_ekf(
     variances `r` of `arrowhead_ekf_model`. Truth is the position."""
     checks.shape("r", r, (4,))
     checks.positive("r", r)
-    return _delayed(arrowhead_state, r, dt, mean_delay, steps)
+    return _delayed_stream(arrowhead_state, r, dt, mean_delay, steps)
 
 
-def _delayed(path: Numbers, r: Parameter, dt: float, mean_delay: float, steps: int) -> Scenario:
+def _delayed_stream(
+    path: Numbers, r: Parameter, dt: float, mean_delay: float, steps: int
+) -> Scenario:
     start = path(jnp.asarray(0.0))
     size = start.shape[0]
 

@@ -61,14 +61,14 @@ def divergence_curve(
     Raises:
         ValueError: an unknown remedy or push; a setting missing or <= 0.
     """
-    _check(remedy, push, setting)
+    _check_setting(remedy, push, setting)
     time = jnp.asarray(time)
     time = time if jnp.issubdtype(time.dtype, jnp.floating) else time.astype(float)
     if remedy == "memory":
-        early = _error(_growth("none", time, None), push, eps)
+        early = _divergence_error(_remedy_growth("none", time, None), push, eps)
         late = 1 / setting + (eps * setting / 3 if push == "white" else (eps * setting / 2) ** 2)
         return jnp.where(time <= setting, early, late)
-    return _error(_growth(remedy, time, setting), push, eps)
+    return _divergence_error(_remedy_growth(remedy, time, setting), push, eps)
 
 
 @from_recipe
@@ -80,7 +80,7 @@ def divergence_filter(remedy: Remedy, *, dt: float, setting: Numbers = None) -> 
             for "memory" (it sizes a buffer).
         dt: sampling interval in seconds.
     """
-    _check(remedy, "white", setting)
+    _check_setting(remedy, "white", setting)
     checks.positive("dt", dt)
     sensors = position_sensor(1.0 / dt)
     if remedy == "noise":
@@ -106,7 +106,7 @@ def divergence(push: Push, *, eps: float, dt: float = 0.02, length: float = 20.0
     Args:
         push, eps: as in `divergence_curve`.
     """
-    _check("none", push, None)
+    _check_setting("none", push, None)
     checks.positive("dt", dt)
     checks.positive("length", length)
     steps = round(length / dt)
@@ -126,7 +126,7 @@ def divergence(push: Push, *, eps: float, dt: float = 0.02, length: float = 20.0
     return Scenario(simulate, Gaussian(jnp.zeros(1), jnp.eye(1)), 0.0)
 
 
-def _error(growth: Growth, push: Push, eps: Numbers) -> Array:
+def _divergence_error(growth: Growth, push: Push, eps: Numbers) -> Array:
     g, of_g, of_square, of_slope, one = growth
     own = one + of_slope
     if push == "white":
@@ -134,7 +134,7 @@ def _error(growth: Growth, push: Push, eps: Numbers) -> Array:
     return own / g**2 + (eps * of_g / g) ** 2
 
 
-def _growth(remedy: Remedy, t: Array, setting: Numbers) -> Growth:
+def _remedy_growth(remedy: Remedy, t: Array, setting: Numbers) -> Growth:
     if remedy == "none":
         g = 1 + t
         return Growth(g, t + t**2 / 2, t + t**2 + t**3 / 3, t, jnp.ones_like(t))
@@ -166,7 +166,7 @@ def _growth(remedy: Remedy, t: Array, setting: Numbers) -> Growth:
     )
 
 
-def _check(remedy: str, push: str, setting: Numbers) -> None:
+def _check_setting(remedy: str, push: str, setting: Numbers) -> None:
     checks.require(remedy in REMEDIES, "remedy", f"one of {REMEDIES}", repr(remedy))
     checks.require(push in PUSHES, "push", f"one of {PUSHES}", repr(push))
     if remedy != "none":

@@ -45,7 +45,7 @@ def two_bearings_path(key: Array, time: Numbers, q: float = Q, length: float = L
     positions and velocities; that is off by less than a millimetre.
     """
     motion, _ = jax.random.split(key)
-    return _at(_flight(motion, q, length), jnp.asarray(time))
+    return _flight_at(_target_flight(motion, q, length), jnp.asarray(time))
 
 
 @from_recipe
@@ -84,25 +84,27 @@ def two_bearings(
     checks.at_least("delay", delay, 0.0)
     checks.at_least("q", q, 0.0)
     checks.at_least("noise_sd", noise_sd, 0.0)
-    begin, sensor, arrival = _timetable(delay, length)
+    begin, sensor, arrival = _scan_timetable(delay, length)
     steps = arrival.size
     checks.require(steps > 0, "length", "time for one scan to end", length)
     places, period = jnp.asarray(SENSORS)[sensor], jnp.asarray(PERIODS)[sensor]
 
     def simulate(key: Array) -> Simulation:
         motion, noise = jax.random.split(key)
-        flight = _flight(motion, q, length)
-        time, seen = _crossings(flight, jnp.asarray(begin), period, places)
-        bearing = _bearing(flight, places, time)
+        flight = _target_flight(motion, q, length)
+        time, seen = _scan_crossings(flight, jnp.asarray(begin), period, places)
+        bearing = _bearing_from(flight, places, time)
         value = bearing + noise_sd * jax.random.normal(noise, (steps,))
         stream = Measurement(time, value[:, None], jnp.asarray(sensor), seen[:, None])
-        return Simulation(stream, _at(flight, jnp.asarray(arrival))[:, :2], jnp.asarray(arrival))
+        return Simulation(
+            stream, _flight_at(flight, jnp.asarray(arrival))[:, :2], jnp.asarray(arrival)
+        )
 
     prior = Gaussian(jnp.asarray(GUESS), jnp.diag(jnp.square(jnp.asarray(GUESS_SD))))
     return Scenario(simulate, prior, 0.0, "arrival")
 
 
-def _timetable(delay: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scan_timetable(delay: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """When each scan begins, its sensor, and when its bearing arrives, in the order of arrival."""
     counts = [int(length / period) + 1 for period in PERIODS]
     sensor = np.repeat(np.arange(2, dtype=np.int32), counts)
@@ -114,7 +116,7 @@ def _timetable(delay: float, length: float) -> tuple[np.ndarray, np.ndarray, np.
     return (number * period)[order], sensor[order], arrival[order]
 
 
-def _flight(key: Array, q: float, length: float) -> Array:
+def _target_flight(key: Array, q: float, length: float) -> Array:
     """States (K, 4) every `FINE` s from 0 on: integrated white acceleration, exactly."""
     steps = math.ceil(length / FINE) + 1
     push, slip = jax.random.normal(key, (2, steps, 2))
@@ -130,7 +132,7 @@ def _from_zero(steps: Array) -> Array:
     return jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps, 0)])
 
 
-def _at(flight: Array, time: Array) -> Array:
+def _flight_at(flight: Array, time: Array) -> Array:
     """The state (T, 4) at `time` (T,), by cubic interpolation."""
     index = jnp.clip((time / FINE).astype(int), 0, flight.shape[0] - 2)
     s = (time / FINE - index)[:, None]
@@ -142,17 +144,19 @@ def _at(flight: Array, time: Array) -> Array:
     return jnp.concatenate([position, velocity], 1)
 
 
-def _bearing(flight: Array, places: Array, time: Array) -> Array:
-    east, north = (_at(flight, time)[:, :2] - places).T
+def _bearing_from(flight: Array, places: Array, time: Array) -> Array:
+    east, north = (_flight_at(flight, time)[:, :2] - places).T
     return jnp.arctan2(north, east)
 
 
-def _crossings(flight: Array, begin: Array, period: Array, places: Array) -> tuple[Array, Array]:
+def _scan_crossings(
+    flight: Array, begin: Array, period: Array, places: Array
+) -> tuple[Array, Array]:
     """When each scan line meets the target, and whether it does: by bisection."""
 
     def ahead(time: Array) -> Array:
         scan = 2 * jnp.pi * (time - begin) / period
-        return scan - _bearing(flight, places, time) % (2 * jnp.pi)
+        return scan - _bearing_from(flight, places, time) % (2 * jnp.pi)
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds

@@ -123,13 +123,13 @@ def _batch_wls(
         rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
         white = jnp.where(noise.full_rank, cholesky.forward(noise, rows), jnp.nan)
-        return _weighted(weight(params, measurement.time, time), white)
+        return _weighted_rows(weight(params, measurement.time, time), white)
 
     def believed_from(time: Array, prior: Gaussian) -> Array:
         A, c = affine_flow(model, params, time, t0, dtype)
         target = prior.mean if c is None else prior.mean - c
         spread = cholesky.factor(prior.cov)
-        return _weighted(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
+        return _weighted_rows(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
 
     def fitted_at(time: Array) -> Gaussian:
         rows = jax.vmap(partial(seen_from, time))(measurements)
@@ -138,10 +138,12 @@ def _batch_wls(
             rows = jnp.concatenate([rows, believed_from(time, prior)])
         return _least_squares(rows[:, :-1], rows[:, -1])
 
+    # All rows are whitened anew for each report time: together they would take memory times
+    # reports.
     return lax.map(fitted_at, times, batch_size=REPORTS_AT_ONCE)
 
 
-def _weighted(weight: Array, rows: Array) -> Array:
+def _weighted_rows(weight: Array, rows: Array) -> Array:
     """What counts nothing is left out, whatever its rows are."""
     return weight * jnp.where(weight == 0, 0, rows)
 
@@ -149,13 +151,18 @@ def _weighted(weight: Array, rows: Array) -> Array:
 def _least_squares(rows: Array, target: Array) -> Gaussian:
     """argmin |rows x - target|^2 and the inverse of rows'rows, NaN where that is singular."""
     n = rows.shape[1]
+    # The triangular root of [rows, target]'[rows, target] holds R' of the QR factorisation of rows
+    # and Q' target under it: solving with R does not square the condition number as the normal
+    # equations do (Golub & Van Loan, section 5.3).
     lower = triangularise(jnp.c_[rows, target].T)
     lower, turned = lower[:n, :n], lower[n, :n]
     pivot, length = jnp.diag(lower), jnp.sqrt(jnp.sum(rows**2, 0))
     full_rank = jnp.all(pivot > 8 * n * jnp.finfo(rows.dtype).eps * length)
+    # Replaced before it is divided by, so that the NaN of an undetermined time has no NaN slope.
     lower = jnp.where(full_rank, lower, jnp.eye(n, dtype=rows.dtype))
     f = cholesky.Factor(lower, 1 / jnp.diag(lower), full_rank)
     mean = cholesky.backward(f, turned)
+    # One step of iterative refinement takes out the rounding that Gram-Schmidt leaves in Q' target.
     mean = mean + cholesky.solve(f, rows.T @ (target - rows @ mean))
     return Gaussian(
         jnp.where(full_rank, mean, jnp.nan),

@@ -62,6 +62,9 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
     def move(params: Params, state: LagState, time: Array) -> LagState:
         n = state.mean.shape[1]
         moved, F, Q = predict_state(model, params, state.mean[0], state.time, time)
+        # The oldest state leaves the joint covariance and the new one enters it in front: F applies
+        # to the newest block only, so its covariance with the rest is F times the first row of
+        # blocks.
         older = symmetric.unpack(state.cov)[:-n, :-n]
         cross = matmul(F, older[:n])
         newest = matmul(cross[:, :n], F.T) + Q

@@ -104,11 +104,11 @@ def rts(
     prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
     if points is not None:
         transform(points, params, prior.mean.shape[0], dtype)
-    return _rts(model, points, params, measurements, prior, jnp.asarray(t0, dtype))
+    return _smoothed_series(model, points, params, measurements, prior, jnp.asarray(t0, dtype))
 
 
 @partial(jax.jit, static_argnames=("model", "points"))
-def _rts(
+def _smoothed_series(
     model: Model,
     points: SigmaPoints | None,
     params: Params,
@@ -137,6 +137,8 @@ def _rts(
         spread = symmetric.congruence(moved.F, moved.left_cov) + moved.Q
         cross = matmul(moved.F, symmetric.unpack(moved.left_cov))
         G = cholesky.solve(cholesky.factor(symmetric.unpack(spread)), cross).T
+        # Sums of squares. P + G (P_T - P^-) G' subtracts two covariances, which in float32 leaves
+        # negative variances where the smoother gains much.
         rest = jnp.eye(G.shape[0], dtype=G.dtype) - matmul(G, moved.F)
         mean = moved.left + matvec(G, later[0] - moved.predicted)
         cov = symmetric.congruence(rest, moved.left_cov)

@@ -56,23 +56,27 @@ def savgol(
     checks.require(inside, "pos", f"a sample between 0 and {window_length - 1}", pos)
     if deriv > polyorder:
         return jnp.zeros(window_length)
-    return _fitted(_polynomial(polyorder), window_length, pos)[:, deriv] / delta**deriv
+    return (
+        _fitted_coefficients(_polynomial_model(polyorder), window_length, pos)[:, deriv]
+        / delta**deriv
+    )
 
 
 @partial(jax.jit, static_argnames=("model", "window_length"))
-def _fitted(model: Model, window_length: int, pos: Array) -> Array:
+def _fitted_coefficients(model: Model, window_length: int, pos: Array) -> Array:
     """The state at `pos` that is fitted to one at each sample and zero at the others, (W, n)."""
     samples = stream(jnp.arange(window_length) - pos, jnp.zeros(window_length))
 
     def fitted(value: Array) -> Array:
         window = samples._replace(value=value[:, None])
-        return batch_wls(model, None, window, jnp.zeros(1), weight=_even).mean[0]
+        return batch_wls(model, None, window, jnp.zeros(1), weight=_check_even).mean[0]
 
+    # The fit is linear in the samples, so its answers to unit samples are the coefficients.
     return jax.vmap(fitted)(jnp.eye(window_length))
 
 
 @cache
-def _polynomial(order: int) -> Model:
+def _polynomial_model(order: int) -> Model:
     """The state [value, first derivative, ...] of a polynomial, and a look at its value."""
     lift = np.arange(order + 1)[None, :] - np.arange(order + 1)[:, None]
     scale = np.where(lift >= 0, [[1 / factorial(max(k, 0)) for k in row] for row in lift], 0)
@@ -83,5 +87,5 @@ def _polynomial(order: int) -> Model:
     return linear_model(F, np.eye(1, order + 1), np.eye(1))
 
 
-def _even(params: None, measured: Array, at: Array) -> Array:
+def _check_even(params: None, measured: Array, at: Array) -> Array:
     return jnp.ones_like(at)

@@ -133,6 +133,8 @@ def _two_sided(
         ends = (states, one) if reverse else (one, states)
         return jax.tree.map(lambda *x: jnp.concatenate(x), *ends), rejected
 
+    # `past` k holds the first k measurements and `future` k the others: no measurement is in both,
+    # so their information adds up.
     (past, rejected), (future, _) = gathered(reverse=False), gathered(reverse=True)
     count = jnp.searchsorted(in_time.time, times, side="right")
     # An estimate that lacks one of its measurements would be a wrong number without a status. Of
@@ -144,6 +146,7 @@ def _two_sided(
     after = jnp.concatenate([after, jnp.full(1, jnp.inf, after.dtype)])
 
     def smoothed_at(time: Array, k: Array) -> Gaussian:
+        # The prior is a third source: its age counts both ways, as a measurement's at t0 would.
         sources = [jax.tree.map(lambda x: x[k], side) for side in (past, future)]
         if prior is not None:
             sources.append(form.start(model, params, prior, t0))

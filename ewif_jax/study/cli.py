@@ -24,7 +24,7 @@ def main() -> None:
         prepare_cpu()
         status = run(sys.argv[1:])
     except Stopped as stopped:
-        status = _complain(str(stopped), stopped.status)
+        status = _complain_and_end(str(stopped), stopped.status)
     raise SystemExit(status)
 
 
@@ -33,24 +33,24 @@ def run(argv: Sequence[str]) -> int:
     arguments = parser().parse_args(argv)
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
-        return _complain(f'needs {", ".join(missing)}: pip install "ewif_jax[study]"', 1)
+        return _complain_and_end(f'needs {", ".join(missing)}: pip install "ewif_jax[study]"', 1)
     try:
         # before the imports, which take seconds
         if arguments.action == "track" and not arguments.file.is_file():
             what = "is not a regular file" if arguments.file.exists() else "no such file"
             raise Refused(f"{arguments.file}: {what}")
         with jax.enable_x64(arguments.dtype == "float64"):
-            _act(arguments, shlex.join(["ewif-jax", *argv]))
+            _act_on(arguments, shlex.join(["ewif-jax", *argv]))
     except (Refused, OSError) as error:
-        return _complain(str(error), 2)
+        return _complain_and_end(str(error), 2)
     except Stopped as stopped:
-        return _complain(str(stopped), stopped.status)
+        return _complain_and_end(str(stopped), stopped.status)
     except KeyboardInterrupt:
-        return _complain("stopped; the same command resumes what is finished", STOPPED)
+        return _complain_and_end("stopped; the same command resumes what is finished", STOPPED)
     return 0
 
 
-def _act(arguments: argparse.Namespace, command: str) -> None:
+def _act_on(arguments: argparse.Namespace, command: str) -> None:
     from ewif_jax.study.shared.experiment import Experiment, Options
 
     options = Options(
@@ -73,6 +73,6 @@ def _act(arguments: argparse.Namespace, command: str) -> None:
                 study.load()(experiment)
 
 
-def _complain(text: str, status: int) -> int:
+def _complain_and_end(text: str, status: int) -> int:
     print(f"ewif-jax: {text}", file=sys.stderr)
     return status

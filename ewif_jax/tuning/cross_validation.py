@@ -134,12 +134,14 @@ def cross_validated(
     for fold in folds:
         kept, left = (np.asarray(rows, float) for rows in Fold(*fold))
         both = {"params": params, "rows": kept}
-        stays = {"params": _stays(fixed, params), "rows": True}
-        given = {"params": _transforms(options.get("transforms"), params), "rows": None}
+        stays = {"params": _stays_fixed(fixed, params), "rows": True}
+        given = {"params": _transform_tree(options.get("transforms"), params), "rows": None}
         search = tune(of_both, both, **{**options, "fixed": stays, "transforms": given})
         own = search.params["params"]
         names = search.transforms["params"]
-        tuned.append(search._replace(params=own, history=_own(search.history), transforms=names))
+        tuned.append(
+            search._replace(params=own, history=_own_history(search.history), transforms=names)
+        )
         held_out.append(float(value({"params": own, "rows": left})))
         train.append(float(value({"params": own, "rows": kept})))
     count = len(held_out)
@@ -149,18 +151,18 @@ def cross_validated(
     )
 
 
-def _stays(fixed: PyTree, params: Params) -> Any:
+def _stays_fixed(fixed: PyTree, params: Params) -> Any:
     if fixed is None:
         return False
     names = [fixed] if isinstance(fixed, str) else fixed
     return {name: name in names for name in params}
 
 
-def _transforms(given: PyTree, params: Params) -> Any:
+def _transform_tree(given: PyTree, params: Params) -> Any:
     """Of a mapping that names some parameters, None for the others."""
     both = isinstance(given, dict) and isinstance(params, dict)
     return {**dict.fromkeys(params), **given} if both else given
 
 
-def _own(history: dict[str, Any]) -> dict[str, Any]:
+def _own_history(history: dict[str, Any]) -> dict[str, Any]:
     return {**history, "params": history["params"]["params"]}

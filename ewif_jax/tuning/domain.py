@@ -112,7 +112,7 @@ def found_domain(
         refuses: whether the loss refuses known parameters.
     """
     leaves, notes = [jnp.asarray(x) for x in start], []
-    flipped = [_replaced(leaves, k, _flipped(x)) for k, x in enumerate(leaves)]
+    flipped = [_replaced_leaf(leaves, k, _sign_flipped(x)) for k, x in enumerate(leaves)]
     unsure = [k for k, t in enumerate(given) if t is None and leaves[k].size]
     refused = {k: refuses(flipped[k]) for k in unsure}
     asked = [k for k in unsure if not refused[k]]
@@ -124,7 +124,7 @@ def found_domain(
     ]
     for k in range(len(leaves)):
         if transforms[k] == positive() and np.asarray(leaves[k]).min(initial=1) == 0:
-            moved = _lifted(tuple(leaves), k, pricer)
+            moved = _lifted_zeros(tuple(leaves), k, pricer)
             if moved is None:
                 transforms[k] = None
                 notes.append(f"{names[k]} stays 0: no larger value lowers the loss")
@@ -144,7 +144,7 @@ def kept_signs(
         t
         or (
             _one_sided(leaves[k])
-            if leaves[k].size and refuses(_replaced(leaves, k, _flipped(leaves[k])))
+            if leaves[k].size and refuses(_replaced_leaf(leaves, k, _sign_flipped(leaves[k])))
             else unconstrained()
         )
         for k, t in enumerate(given)
@@ -162,16 +162,16 @@ def _one_sided(x: Numbers) -> Transform:
     return negative() if np.all(value < 0) else unconstrained()
 
 
-def _flipped(x: Numbers) -> Any:
+def _sign_flipped(x: Numbers) -> Any:
     scale = jnp.max(jnp.abs(x))
     return jnp.where(x == 0, -FRACTION * jnp.where(scale > 0, scale, 1), -x)
 
 
-def _replaced(leaves: Sequence[Any], k: int, new: Any) -> Leaves:
+def _replaced_leaf(leaves: Sequence[Any], k: int, new: Any) -> Leaves:
     return tuple(new if i == k else x for i, x in enumerate(leaves))
 
 
-def _lifted(leaves: Leaves, k: int, pricer: Pricer) -> Any:
+def _lifted_zeros(leaves: Leaves, k: int, pricer: Pricer) -> Any:
     """Leaf k with its zeros at the smallest value that lowers the loss; None if none does."""
     leaf = leaves[k]
     scale = float(jnp.max(leaf)) or 1.0
@@ -179,7 +179,7 @@ def _lifted(leaves: Leaves, k: int, pricer: Pricer) -> Any:
     margin = 10 * float(jnp.finfo(leaf.dtype).eps) * (abs(before) if np.isfinite(before) else 0)
     for power in range(FIRST_TRIED, LAST_TRIED + 1):
         tried = jnp.where(leaf == 0, jnp.asarray(scale * 10.0**power, leaf.dtype), leaf)
-        if pricer.value(_replaced(leaves, k, tried)) < before - margin:
+        if pricer.value(_replaced_leaf(leaves, k, tried)) < before - margin:
             return tried
     return None
 

@@ -141,7 +141,7 @@ def tune(
     points = start_points(starts, domain.start, others, coordinates)
     _refuse_what_cannot_be_held(points, coordinates, names)
     rounding = max(10 * max(float(jnp.finfo(x.dtype).eps) for x in moving), 1e-12)
-    chosen = method or _default(key, points[0].size)
+    chosen = method or _default_method(key, points[0].size)
     held_out = _held_out(validation, objective, held)
     descents = []
     for point in points:
@@ -151,7 +151,7 @@ def tune(
             )
         else:
             stops_at = rounding**0.5 if optimizer is None and chosen == "lbfgs" else None
-            used = optimizer or _optimizer(chosen, steps)
+            used = optimizer or _kept_optimizer(chosen, steps)
             asking = by_optimizer(used, point, coordinates, objective, pricer, stops_at)
         descents.append(Descent(asking, coordinates, key is None, held_out, patience))
     descend(descents, pricer, steps, progress)
@@ -175,14 +175,14 @@ def _refuse_what_cannot_be_held(
             checks.require(is_held, f"params['{name}']", expected, "one it cannot")
 
 
-def _default(key: RandomKey, size: int) -> str:
+def _default_method(key: RandomKey, size: int) -> str:
     if key is not None:
         return "adam"
     return "quasi-newton" if size <= FEW else "lbfgs"
 
 
 @cache
-def _optimizer(method: str, steps: int) -> Any:
+def _kept_optimizer(method: str, steps: int) -> Any:
     """One object for equal settings, so that nothing is compiled again."""
     import optax  # here, because it takes longer to import than the rest of the package
 

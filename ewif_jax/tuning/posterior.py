@@ -86,7 +86,7 @@ def posterior(
     def log_density(free: PyTree) -> Array:
         own = constrain(free)
         stretch = [
-            jnp.sum(jnp.log(jnp.abs(_slope(t, y))))
+            jnp.sum(jnp.log(jnp.abs(_transform_slope(t, y))))
             for t, y in zip(found, jax.tree.leaves(free), strict=True)
         ]
         total = likelihood(own) + sum(stretch)
@@ -96,6 +96,6 @@ def posterior(
     return Posterior(log_density, jax.tree.unflatten(structure, start), constrain)
 
 
-def _slope(transform: Transform, free: Array) -> Array:
+def _transform_slope(transform: Transform, free: Array) -> Array:
     """dx / dy of each number."""
     return jax.jvp(transform.constrain, (free,), (jnp.ones_like(free),))[1]

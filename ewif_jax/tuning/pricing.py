@@ -92,19 +92,21 @@ class Coordinates:
         )
 
 
-def _constrain(transforms: tuple[Transform, ...], free: Leaves) -> tuple[Array, ...]:
+def _constrained_leaves(transforms: tuple[Transform, ...], free: Leaves) -> tuple[Array, ...]:
     return tuple(t.constrain(x) for t, x in zip(transforms, free, strict=True))
 
 
-def _pull(transforms: tuple[Transform, ...], free: Leaves, slopes: Leaves) -> tuple[Array, ...]:
+def _pulled_slopes(
+    transforms: tuple[Transform, ...], free: Leaves, slopes: Leaves
+) -> tuple[Array, ...]:
     def constrained(free: Leaves) -> tuple[Array, ...]:
-        return _constrain(transforms, free)
+        return _constrained_leaves(transforms, free)
 
     return jax.vjp(constrained, free)[1](tuple(slopes))[0]
 
 
-_constrained: Callable[..., Leaves] = jax.jit(_constrain, static_argnums=0)
-_pulled: Callable[..., Leaves] = jax.jit(_pull, static_argnums=0)
+_constrained: Callable[..., Leaves] = jax.jit(_constrained_leaves, static_argnums=0)
+_pulled: Callable[..., Leaves] = jax.jit(_pulled_slopes, static_argnums=0)
 
 
 def transform_name(transform: Transform) -> str:

@@ -90,14 +90,16 @@ def profile_intervals(
     drop = float(ndtri(0.5 + level / 2))
     ends = []
     for sign in (-1, 1):
-        far = [_end(priced, best, lowest, k, sign, drop, has_ends) for k in range(len(leaves))]
-        moved = [coordinates.leaves(_moved(best, k, x))[k] for k, x in enumerate(far)]
+        far = [
+            _interval_end(priced, best, lowest, k, sign, drop, has_ends) for k in range(len(leaves))
+        ]
+        moved = [coordinates.leaves(_moved_number(best, k, x))[k] for k, x in enumerate(far)]
         ends.append(moved)
     low, high = (jax.tree.unflatten(structure, [jnp.asarray(x) for x in side]) for side in ends)
     return ProfileIntervals(low, high)
 
 
-def _end(
+def _interval_end(
     priced: Callable[[np.ndarray], tuple[float, np.ndarray]],
     best: np.ndarray,
     lowest: float,
@@ -113,8 +115,12 @@ def _end(
 
     def excess(distance: float) -> float:
         nonlocal others
-        moved = _moved(others, k, best[k] + sign * distance)
-        others, value = _least(priced, moved, k, has_ends)
+        moved = _moved_number(others, k, best[k] + sign * distance)
+        # The others start from where they were best for the last distance: the profile is followed
+        # like a path, and stays in its valley.
+        others, value = _least_loss(priced, moved, k, has_ends)
+        # The signed root is nearly a straight line in the distance where the ratio is a parabola,
+        # which is what a secant step wants. What is not finite counts as far outside.
         root = np.sqrt(2 * max(value - lowest, 0.0)) if np.isfinite(value) else 1e6
         return float(root - drop)
 
@@ -127,7 +133,7 @@ def _end(
     return float(best[k] + sign * root)
 
 
-def _least(
+def _least_loss(
     priced: Callable[[np.ndarray], tuple[float, np.ndarray]],
     point: np.ndarray,
     k: int,
@@ -153,7 +159,7 @@ def _least(
             return least
 
 
-def _moved(point: np.ndarray, k: int, to: float) -> np.ndarray:
+def _moved_number(point: np.ndarray, k: int, to: float) -> np.ndarray:
     moved = point.copy()
     moved[k] = to
     return moved

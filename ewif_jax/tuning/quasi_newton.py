@@ -78,7 +78,7 @@ def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked
         return Ended("not finite", ends)
     refused, reason = False, ""
     for _ in range(3):
-        best, reason, left = yield from _descended(best, rounding)
+        best, reason, left = yield from _descent_result(best, rounding)
         refused |= left
         tolerance = rounding * abs(best.value)
         lower, ends = yield from _looked_around(best, best.point - start, has_ends, tolerance)
@@ -88,7 +88,7 @@ def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked
     return Ended(reason, ends, refused)
 
 
-def _descended(
+def _descent_result(
     seen: Seen, rounding: float
 ) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[Seen, str, bool]]:
     """The end of one descent, why it ended, and whether a step was refused as not finite."""
@@ -117,7 +117,8 @@ def _descended(
             refused, radius = True, length / 4
             continue
         gained = (seen.value - value) / expected
-        curvature = _updated(curvature, step, gradient - seen.gradient)
+        # Also after a step that is not taken: its gradient says as much about the curvature as any.
+        curvature = _updated_curvature(curvature, step, gradient - seen.gradient)
         if gained < 0.1:
             radius = length / 4
         elif gained > 0.7 and length > 0.8 * radius:
@@ -158,6 +159,8 @@ def shortest(curvature: np.ndarray, gradient: np.ndarray, radius: float) -> np.n
     """The step (n,) within `radius` to the least of g'p + p'Bp / 2."""
     values, vectors = np.linalg.eigh(curvature)
     along = vectors.T @ gradient
+    # The step of the trust region solves (B + mu) p = -g with the least mu >= -lambda_min for which
+    # |p| fits; |p| falls as mu grows, so halving the interval finds it (More & Sorensen 1983).
     floor = max(0.0, -values[0])
     if values[0] > 0 and np.linalg.norm(along / values) <= radius:
         return -vectors @ (along / values)
@@ -175,9 +178,11 @@ def shortest(curvature: np.ndarray, gradient: np.ndarray, radius: float) -> np.n
     return vectors @ step
 
 
-def _updated(curvature: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _updated_curvature(curvature: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
     missed = change - curvature @ step
     along = missed @ step
+    # The safeguard of symmetric rank-one: the denominator may vanish though nothing is wrong, and
+    # the update is then left out (Nocedal & Wright, (6.26)).
     if abs(along) <= 1e-8 * np.linalg.norm(step) * np.linalg.norm(missed):
         return curvature
     return curvature + np.outer(missed, missed) / along

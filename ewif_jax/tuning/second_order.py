@@ -129,7 +129,7 @@ def standard_errors(
     flags = tuple(moves)
     found = _second_order(estimator, whole, measurements, arrays, options, flags, kind)
     gradient, hessian, scores_ = (np.asarray(x, float) for x in found)
-    cov, distance = _covariance(gradient, hessian, scores_ if kind == "sandwich" else None)
+    cov, distance = _covariance_of(gradient, hessian, scores_ if kind == "sandwich" else None)
     flat, unflatten = ravel_pytree(whole)
     place = np.concatenate(
         [np.full(np.size(x), m) for x, m in zip(jax.tree.leaves(whole), moves, strict=True)]
@@ -195,6 +195,8 @@ def _second_order(
         return found[0] if found.shape[0] == 1 else jnp.sum(found, -1)
 
     slope = jax.grad(total)
+    # Forward over reverse: the gradient is one reverse pass, and its k directional derivatives
+    # share it.
     hessian = jax.jacfwd(slope)(flat)
     if kind == "observed":
         return slope(flat), hessian, jnp.zeros((0, flat.size), flat.dtype)
@@ -202,7 +204,7 @@ def _second_order(
     return jnp.sum(by_run, 0), hessian, by_run
 
 
-def _covariance(
+def _covariance_of(
     gradient: np.ndarray, hessian: np.ndarray, by_run: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """The covariance (k, k), and how many standard errors the maximum is away.
@@ -215,6 +217,8 @@ def _covariance(
         return np.full((size, size), np.nan), np.nan
     unit = 1 / np.sqrt(diagonal)
     scaled = (hessian + hessian.T) / 2 * unit * unit[:, None]
+    # A Hessian that is not positive has no maximum there: NaN says so, where an inverse would give
+    # errors of imaginary or arbitrary size.
     if np.linalg.eigvalsh(scaled).min() <= size * np.finfo(float).eps:
         return np.full((size, size), np.nan), np.nan
     inverse = np.linalg.inv(scaled)
@@ -223,6 +227,7 @@ def _covariance(
     if by_run is not None:
         count = len(by_run)
         spread = by_run * unit
+        # N / (N - 1): the scores sum to zero at the maximum, which takes one degree of freedom.
         meat = spread.T @ spread * (count / max(count - 1, 1))
         inverse = inverse @ meat @ inverse
     return inverse * unit * unit[:, None], distance

@@ -36,12 +36,12 @@ def tuned_from(
     params = objective.params(tuple(jnp.asarray(x[place]) for x in trails), held)
     said = ["fixed" if t is None else transform_name(t) for t in domain.transforms]
     transforms = objective.params(tuple(said), ("fixed",) * len(held))
-    reason = _reason(descent, domain.notes, names, steps)
+    reason = _reason_ended(descent, domain.notes, names, steps)
     lowest, length, evaluations = float(loss[place]), descent.lengths[place], len(descent.losses)
     return Tuned(params, lowest, history, reason, length, transforms, method, evaluations)
 
 
-def _reason(descent: Descent, notes: list[str], names: Sequence[str], steps: int) -> str:
+def _reason_ended(descent: Descent, notes: list[str], names: Sequence[str], steps: int) -> str:
     """Why it ended."""
     ended, coordinates = descent.ended, descent.coordinates
     count = len(descent.losses)

@@ -50,7 +50,7 @@ class Tuned(NamedTuple):
         rows = [("parameter", "start", "tuned", "moves")]
         for (path, leaf), name, start in zip(paths, names, first, strict=True):
             label = jax.tree_util.keystr(path, simple=True, separator=".") or "params"
-            rows.append((label, _short(start), _short(leaf), name))
+            rows.append((label, _short_text(start), _short_text(leaf), name))
         wide = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = ["  ".join(x.ljust(w) for x, w in zip(row, wide, strict=True)) for row in rows]
         ends = f"loss {self.history['loss'][0]:.6g} -> {self.loss:.6g}, "
@@ -58,7 +58,7 @@ class Tuned(NamedTuple):
         return "\n".join([*(line.rstrip() for line in lines), ends, self.reason])
 
 
-def _short(x: object) -> str:
+def _short_text(x: object) -> str:
     value = np.asarray(x)
     if value.size > 4:
         return f"{value.dtype}{list(value.shape)}"

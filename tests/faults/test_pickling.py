@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ewif_jax as ej
-from ewif_jax.monte_carlo import _simulate
+from ewif_jax.monte_carlo import _simulate_runs
 from ewif_jax.transforms import Transform
 
 TRACES = {"F": 0}
@@ -193,9 +193,9 @@ def test_a_filter_made_again_is_not_compiled_again(entry):
 def test_a_scenario_made_again_is_not_compiled_again():
     keys = jax.random.split(jax.random.key(0), 3)
     first = ej.simulate_batch(ej.scenarios.sine(), keys)
-    before = _simulate._cache_size()
+    before = _simulate_runs._cache_size()
     again = ej.simulate_batch(ej.scenarios.sine(), keys)
-    assert _simulate._cache_size() == before
+    assert _simulate_runs._cache_size() == before
     np.testing.assert_array_equal(first.truth, again.truth)
 
 

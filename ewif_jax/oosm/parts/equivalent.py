@@ -63,6 +63,8 @@ def tied_to_start(
     weights, _ = symmetric.regress(M, matmul(symmetric.rows(H, cov, H_where), F.T))
     value = value + matvec(weights, state.mean - predicted)
     left = H - matmul(weights, F)
+    # H cov(x_d | x_k) H' in Joseph's form, with G inside as H G: rounding of the weights enters
+    # squared.
     spread = matmul(symmetric.rows(left, cov), left.T) + matmul(matmul(weights, Q), weights.T)
     # A plain update in sequence, to the last digit: there M adds nothing but its rounding.
     late = time < now
@@ -107,7 +109,9 @@ def moved_back(
     if not model.returns_well:
         # The derivative of a motion that overflows is not a number even where it is not selected,
         # so the time is replaced, not the matrix.
-        good = lax.stop_gradient(_returns(predict_state(model, params, origin, state.time, at)[1]))
+        good = lax.stop_gradient(
+            _has_way_back(predict_state(model, params, origin, state.time, at)[1])
+        )
         at = jnp.where(good, at, state.time)
     there, back, _ = predict_state(model, params, origin, state.time, at)
     value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
@@ -124,6 +128,6 @@ def moved_back(
     return Compared(difference, seen - weights, R, measurement.mask & good), good
 
 
-def _returns(back: Array) -> Array:
+def _has_way_back(back: Array) -> Array:
     """Whether numbers come back through this matrix: A Q A' has to be finite."""
     return jnp.max(jnp.abs(back)) < jnp.finfo(back.dtype).max ** 0.25

@@ -54,6 +54,8 @@ def one_step(model: Model, method: str, lag: int, equivalent: Equivalent) -> Est
         now = CovarianceState(state.time, state.mean, state.cov)
         moved = in_sequence.move(params, now, time)
         left = time > state.time
+        # Only what the filter learnt something from is worth a slot: a time of prediction alone is
+        # between its neighbours anyway, and would shorten the reach.
         push = left & state.used
         past = jax.tree.map(lambda new, old: slots.pushed(new, old, push), now, state.past)
         return HistoryState(time, moved.mean, moved.cov, state.used & ~left, past)

@@ -20,12 +20,14 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"ewif-jax {version('ewif_jax')}")
     commands = top.add_subparsers(dest="action", required=True, metavar="COMMAND")
-    _study(commands.add_parser("study", help="repeat a published experiment"))
-    _track(commands.add_parser("track", help="filter your own measurements from a CSV file"))
+    _study_options(commands.add_parser("study", help="repeat a published experiment"))
+    _track_options(
+        commands.add_parser("track", help="filter your own measurements from a CSV file")
+    )
     return top
 
 
-def _common(parser: argparse.ArgumentParser) -> None:
+def _common_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("common options")
     group.add_argument("--seed", type=seed, default=0, help="of the random numbers (0)")
     group.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
@@ -35,7 +37,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--dtype", choices=("float64", "float32"), default="float64")
 
 
-def _study(parser: argparse.ArgumentParser) -> None:
+def _study_options(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = [f"  {study.name:20}{study.help}" for study in STUDIES]
     parser.description = "\n".join(["Studies:", *lines, f"  {'all':20}all of them"])
@@ -43,10 +45,10 @@ def _study(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=whole(2), help="simulated runs (the study's own choice)")
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
     parser.add_argument("--chunk", type=whole(1), help="runs in memory at once (1024)")
-    _common(parser)
+    _common_options(parser)
 
 
-def _track(parser: argparse.ArgumentParser) -> None:
+def _track_options(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Runs a filter over the measurements in a CSV file, all tracks in one batch, and tells "
         "how well each measurement is predicted from the earlier ones."
@@ -105,7 +107,7 @@ def _track(parser: argparse.ArgumentParser) -> None:
     tuning.add_argument(
         "--warm-up", type=whole(0), default=5, help="first rows of a track not scored (5)"
     )
-    _common(parser)
+    _common_options(parser)
 
 
 def whole(least: int) -> Callable[[str], int]:

@@ -173,7 +173,7 @@ class Experiment:
         for row in rows:
             table.add_row(*(Text(shown(value)) for value in row.values()))
         self.console.print(table)
-        self.csv(name, pd.DataFrame([_flat(row) for row in rows]))
+        self.csv(name, pd.DataFrame([_flat_row(row) for row in rows]))
 
     def csv(self, name: str, frame: pd.DataFrame) -> None:
         """Saves a data frame as `name`.csv."""
@@ -228,7 +228,7 @@ def shown(value: Numbers) -> str:
             return str(value)
 
 
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+def _flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for column, value in row.items():
         if isinstance(value, Measured):

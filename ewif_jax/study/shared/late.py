@@ -68,7 +68,7 @@ def sweep(
         # equal parts (the last padded) are compiled once
         index = np.minimum(np.arange(begin, begin + size), count - 1)
         some = {name: v[index].reshape(-1) for name, v in full.items()}
-        found.append(_averages(estimator, some, batch, setting))
+        found.append(_average_errors(estimator, some, batch, setting))
         if progress is not None:
             progress(min(begin + size, count), count)
     return {name: np.concatenate([f[name] for f in found])[:count] for name in METRICS}
@@ -109,7 +109,7 @@ def rmses(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found[:, 0], found[:, 1]
 
 
-def _averages(
+def _average_errors(
     estimator: Estimator, settings: dict[str, np.ndarray], batch: Simulation, setting: Any
 ) -> dict[str, np.ndarray]:
     runs = batch.truth.shape[0]

@@ -15,19 +15,19 @@ NAME = "about.json"
 def sealed(about: Mapping[str, Any]) -> str:
     """The text of `about.json`: `about` and a digest of it, by which an edit is seen."""
     text = json.dumps(about, indent=2, default=str)
-    return json.dumps({**json.loads(text), "seal": _seal(json.loads(text))}, indent=2) + "\n"
+    return json.dumps({**json.loads(text), "seal": _seal_of(json.loads(text))}, indent=2) + "\n"
 
 
 def is_ours(folder: Path) -> bool:
     """Whether this program made the folder. An empty one is anybody's."""
-    return not any(folder.iterdir()) or _listed(folder) is not None
+    return not any(folder.iterdir()) or _listed_digests(folder) is not None
 
 
 def clear(earlier: Path, final: Path) -> list[Path]:
     """Deletes from the folder `earlier` what this program wrote into it, and the folder if nothing
     is left. Everything else is moved to `final` under its own name, or stays where that is taken.
     Returns where it is."""
-    files = _listed(earlier)
+    files = _listed_digests(earlier)
     if files is None:
         if earlier.is_dir() and not any(earlier.iterdir()):
             earlier.rmdir()
@@ -46,7 +46,7 @@ def clear(earlier: Path, final: Path) -> list[Path]:
     return kept
 
 
-def _listed(folder: Path) -> dict[str, str] | None:
+def _listed_digests(folder: Path) -> dict[str, str] | None:
     """Digests by name; None if there is no list of ours."""
     try:
         about = json.loads((folder / NAME).read_text(encoding="utf-8"))
@@ -57,7 +57,7 @@ def _listed(folder: Path) -> dict[str, str] | None:
     seal, files = about.pop("seal"), about.get("files")
     if not isinstance(files, dict):
         return None
-    if seal == _seal(about):
+    if seal == _seal_of(about):
         files = {**files, NAME: digest_of(folder / NAME)}
     return files
 
@@ -75,6 +75,6 @@ def _is_written(path: Path, files: Mapping[str, str]) -> bool:
     return path.name in files and digest_of(path) == files[path.name]
 
 
-def _seal(about: Mapping[str, Any]) -> str:
+def _seal_of(about: Mapping[str, Any]) -> str:
     text = json.dumps(about, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -146,7 +146,11 @@ def choose_columns(
         role: str, given: str | None, names: Iterable[str], taken: Sequence[str] = ()
     ) -> str | None:
         if given is not None:
-            return None if given == NONE and NONE not in table.names else _given(table, role, given)
+            return (
+                None
+                if given == NONE and NONE not in table.names
+                else _given_columns(table, role, given)
+            )
         for name in names:
             match = [x for x in table.names if simple(x) == name and x not in taken]
             if len(set(match)) > 1:
@@ -162,32 +166,32 @@ def choose_columns(
     when = pick("time", time, TIMES)
     if when is None:
         raise Refused(
-            f"{table.path}: say which column is the time (--time); {_listed(table.names)}"
+            f"{table.path}: say which column is the time (--time); {_listed_names(table.names)}"
         )
     if latlon is not None and len(latlon) != 2:
         raise Refused(f"--latlon: expected two columns, got {','.join(latlon)}")
     if latlon is not None:
-        where = tuple(_given(table, "latlon", name) for name in latlon)
+        where = tuple(_given_columns(table, "latlon", name) for name in latlon)
     elif values is not None:
         where = None
     else:
-        where = _first(table, LATLON, guessed, "lat, lon", "latlon")
+        where = _first_group(table, LATLON, guessed, "lat, lon", "latlon")
     what = where
     if what is None and values is not None:
-        what = tuple(_given(table, "values", name) for name in values)
+        what = tuple(_given_columns(table, "values", name) for name in values)
     if what is None:
-        what = _first(table, VALUES, guessed, "values", "values")
+        what = _first_group(table, VALUES, guessed, "values", "values")
     if what is None:
         raise Refused(
             f"{table.path}: say which columns are measured (--values or --latlon); "
-            f"{_listed(table.names)}"
+            f"{_listed_names(table.names)}"
         )
     used = (when, *what)
     day = pick("date", date, DATES, used) if date is not None or _of_day(table, when) else None
     sides: tuple[str | None, ...] = ()
     if where is not None:
         sides = tuple(
-            _beside(table, name, letters, names)
+            _hemisphere_column(table, name, letters, names)
             for name, letters, names in zip(where, (NORTH, EAST), (NORTHS, EASTS), strict=True)
         )
     return Columns(
@@ -209,15 +213,17 @@ def _of_day(table: Table, name: str) -> bool:
     return is_of_day(table.column(name))
 
 
-def _given(table: Table, role: str, name: str) -> str:
+def _given_columns(table: Table, role: str, name: str) -> str:
     plain = {x.lstrip("#").strip(): x for x in (*table.names, name)}
     name = plain[name.lstrip("#").strip()] if name not in table.names else name
     if name not in table.names:
-        raise Refused(f"{table.path}: has no column {name!r} for --{role}; {_listed(table.names)}")
+        raise Refused(
+            f"{table.path}: has no column {name!r} for --{role}; {_listed_names(table.names)}"
+        )
     return name
 
 
-def _first(
+def _first_group(
     table: Table,
     groups: Iterable[tuple[str, ...]],
     guessed: list[str],
@@ -238,7 +244,9 @@ def _first(
     return None
 
 
-def _beside(table: Table, name: str, letters: dict[str, int], names: Sequence[str]) -> str | None:
+def _hemisphere_column(
+    table: Table, name: str, letters: dict[str, int], names: Sequence[str]
+) -> str | None:
     """The column of hemispheres that belongs to a column of degrees: by its name, or next to it and
     with nothing else in it."""
     index = table.names.index(name)
@@ -250,5 +258,5 @@ def _beside(table: Table, name: str, letters: dict[str, int], names: Sequence[st
     return None
 
 
-def _listed(have: Sequence[str]) -> str:
+def _listed_names(have: Sequence[str]) -> str:
     return f"it has {', '.join(have)}"

@@ -55,11 +55,11 @@ def track(arguments: argparse.Namespace, options: Options) -> None:
     if arguments.tune and not counted.any():
         raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to tune by")
     chosen = method(arguments, tracks)
-    with Experiment("track", options, _settings(arguments)) as experiment:
-        _followed(experiment, arguments, readings, tracks, counted, chosen)
+    with Experiment("track", options, _command_settings(arguments)) as experiment:
+        _followed_tracks(experiment, arguments, readings, tracks, counted, chosen)
 
 
-def _followed(
+def _followed_tracks(
     experiment: Experiment,
     arguments: argparse.Namespace,
     readings: Readings,
@@ -67,31 +67,31 @@ def _followed(
     counted: np.ndarray,
     chosen: Method,
 ) -> None:
-    _introduce(experiment, readings, tracks)
+    _introduce_file(experiment, readings, tracks)
     stamped = {"validity": [group.measurements for group in tracks.groups]}
     if readings.columns.arrival is not None:
         stamped["report"] = [g.measurements._replace(time=g.arrival) for g in tracks.groups]
     outcomes = [
-        _outcome(experiment, arguments, chosen, stamps, tracks, streams, counted)
+        _setting_outcome(experiment, arguments, chosen, stamps, tracks, streams, counted)
         for stamps, streams in stamped.items()
     ]
-    _save(experiment, readings, tracks, outcomes)
+    _save_estimates(experiment, readings, tracks, outcomes)
     experiment.figure("tracks", track_figures.tracks(tracks, outcomes[0].after))
     experiment.figure("innovations", track_figures.innovations(tracks, outcomes[0], counted))
     if arguments.tune:
         drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
         experiment.figure("tuning", drawn)
     seed = arguments.seed
-    rows = [row for o in outcomes for row in _rows(o, chosen, tracks.row, counted, seed)]
+    rows = [row for o in outcomes for row in _outcome_rows(o, chosen, tracks.row, counted, seed)]
     title = f"One-step prediction: {arguments.estimator}, {arguments.model}"
-    notes = [_statuses(outcomes[0]), *_lost(outcomes, counted)]
+    notes = [_status_counts(outcomes[0]), *_lost_rows(outcomes, counted)]
     if not counted.any():
         notes.append(f"--warm-up: {arguments.warm_up} leaves no measurement to score.")
     experiment.table("track", title, rows, notes)
     experiment.finish()
 
 
-def _outcome(
+def _setting_outcome(
     experiment: Experiment,
     arguments: argparse.Namespace,
     chosen: Method,
@@ -134,7 +134,7 @@ def _outcome(
             tracks,
             counted,
         )
-    _tell(experiment, stamps, chosen, LABEL[arguments.loss], tuned, checked)
+    _tell_result(experiment, stamps, chosen, LABEL[arguments.loss], tuned, checked)
     with experiment.timed("filtering"):
         best = {chosen.name: tuned.params[chosen.name]}
         after = filtered(chosen, {**chosen.params, **best}, tracks, batches)
@@ -142,7 +142,7 @@ def _outcome(
     return Outcome(stamps, before, after, value, tuned.history)
 
 
-def _tell(
+def _tell_result(
     experiment: Experiment,
     stamps: str,
     chosen: Method,
@@ -163,7 +163,7 @@ def _tell(
     experiment.say(f"{'; '.join(said)}. Ended: {tuned.reason}.")
 
 
-def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:
+def _introduce_file(experiment: Experiment, readings: Readings, tracks: Tracks) -> None:
     experiment.say(" ".join([str(readings.columns), *readings.notes]))
     left = "".join(f"; {count} {why}" for why, count in tracks.dropped.items())
     experiment.say(
@@ -172,7 +172,7 @@ def _introduce(experiment: Experiment, readings: Readings, tracks: Tracks) -> No
     )
 
 
-def _rows(
+def _outcome_rows(
     outcome: Outcome, chosen: Method, row: np.ndarray, counted: np.ndarray, seed: int
 ) -> list[dict[str, Any]]:
     pairs = [("given" if outcome.history is None else "before", outcome.value[0], outcome.before)]
@@ -191,13 +191,13 @@ def _rows(
     ]
 
 
-def _statuses(outcome: Outcome) -> str:
+def _status_counts(outcome: Outcome) -> str:
     status = outcome.after["status"]
     counts = [(kind.name.lower().replace("_", " "), (status == kind).sum()) for kind in Status]
     return "Measurements: " + ", ".join(f"{count} {kind}" for kind, count in counts if count)
 
 
-def _lost(outcomes: list[Outcome], counted: np.ndarray) -> list[str]:
+def _lost_rows(outcomes: list[Outcome], counted: np.ndarray) -> list[str]:
     """What to say of rows that only one of the two settings predicts, which no row counts."""
     notes = []
     for outcome in outcomes:
@@ -210,7 +210,7 @@ def _lost(outcomes: list[Outcome], counted: np.ndarray) -> list[str]:
     return notes
 
 
-def _save(
+def _save_estimates(
     experiment: Experiment, readings: Readings, tracks: Tracks, outcomes: list[Outcome]
 ) -> None:
     """estimates.csv and track.nc: what the filter says after each measurement, of the time
@@ -272,7 +272,7 @@ def state_names(n: int, dims: int) -> list[str]:
     return [prefix + axis for prefix in ("", "v", "a")[: n // dims] for axis in AXES[:dims]]
 
 
-def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def _command_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     left_out = ("action", "out", "overwrite", "runs", "quick", "chunk", "dtype", "seed")
     given = {k: str(v) for k, v in vars(arguments).items() if k not in left_out}
     digest = hashlib.sha256(arguments.file.read_bytes()).hexdigest()[:12]

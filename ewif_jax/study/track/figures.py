@@ -28,7 +28,7 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
     figure, (left, right) = canvas(1, 2, width=11, height=4.8)
     longest = int(np.argmax(np.bincount(found.row)))
     for row in range(min(len(found.name), MOST)):
-        place = _place(found, row, estimate["mean"])
+        place = _track_place(found, row, estimate["mean"])
         focus = row == longest
         left.plot(*place, color=KALMAN if focus else OTHER, linewidth=1.6 if focus else 0.7)
     name = found.name[longest]
@@ -44,7 +44,7 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
     else:
         left.set_aspect("equal", adjustable="datalim")
         label(left, "x [m]", "y [m]", many)
-    _zoom(right, found, estimate, longest)
+    _draw_zoom(right, found, estimate, longest)
     return figure
 
 
@@ -68,7 +68,7 @@ def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
         axes.set_ylim(bottom=np.quantile(points, 0.01) / 2 if points.size else None)
         for text, run, color, style in runs:
             good = counted & np.isfinite(run[key])
-            middle = _binned(time[good], run[key][good], statistic)
+            middle = _binned_statistic(time[good], run[key][good], statistic)
             axes.plot(*middle, style, color=color, linewidth=1.8, label=word + text)
         plain_ticks(axes)
     below.axhline(1, color=TRUTH, linewidth=0.8, label="expected mean")
@@ -93,7 +93,7 @@ def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
     return figure
 
 
-def _place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _track_place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     here = found.row == row
     if found.origin is not None:
         where = to_degrees(mean[here, :2], found.origin[row])
@@ -103,7 +103,7 @@ def _place(found: Tracks, row: int, mean: np.ndarray) -> tuple[np.ndarray, np.nd
     return mean[here, 0], mean[here, 1]
 
 
-def _zoom(axes: Any, found: Tracks, estimate: dict[str, np.ndarray], row: int) -> None:
+def _draw_zoom(axes: Any, found: Tracks, estimate: dict[str, np.ndarray], row: int) -> None:
     """Each axis of one track against time, less a straight line."""
     here = found.row == row
     time, value, seen = found.time[here], found.value[here], found.mask[here]
@@ -119,7 +119,9 @@ def _zoom(axes: Any, found: Tracks, estimate: dict[str, np.ndarray], row: int) -
     label(axes, "time since start [s]", "distance from a straight line [m]", found.name[row])
 
 
-def _binned(time: np.ndarray, value: np.ndarray, statistic: Any) -> tuple[np.ndarray, np.ndarray]:
+def _binned_statistic(
+    time: np.ndarray, value: np.ndarray, statistic: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """A statistic in up to 25 bins of equal numbers."""
     order = np.array_split(np.argsort(time), max(min(25, len(time) // 8), 1))
     parts = [part for part in order if part.size]

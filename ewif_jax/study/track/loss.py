@@ -106,7 +106,7 @@ def filtered(
             measurements,
             prior=method.prior_of(some),
             t0=0.0,
-            observe=_seen,
+            observe=_seen_row,
             devices=1,
         )
         every.append({name: np.asarray(x) for name, x in found.items()})
@@ -127,14 +127,14 @@ def report(
     cuts = np.searchsorted(row[used], np.arange(1, row.max() + 1))
     errors, nis_of = (np.split(found[name][used], cuts) for name in ("error", "nis"))
     return {
-        "median error [m]": _resampled(errors, np.median, seed),
-        "RMSE [m]": _resampled(errors, lambda x: np.sqrt(np.mean(x**2)), seed),
-        "NIS per component": _resampled(nis_of, np.mean, seed),
+        "median error [m]": _resampled_statistic(errors, np.median, seed),
+        "RMSE [m]": _resampled_statistic(errors, lambda x: np.sqrt(np.mean(x**2)), seed),
+        "NIS per component": _resampled_statistic(nis_of, np.mean, seed),
         "scored": int(used.sum()),
     }
 
 
-def _seen(step: Step, _: None) -> dict[str, Array]:
+def _seen_row(step: Step, _: None) -> dict[str, Array]:
     info = step.info
     return {
         "mean": step.mean,
@@ -146,7 +146,9 @@ def _seen(step: Step, _: None) -> dict[str, Array]:
     }
 
 
-def _resampled(groups: list[np.ndarray], statistic: Callable[[Any], Any], seed: int) -> Measured:
+def _resampled_statistic(
+    groups: list[np.ndarray], statistic: Callable[[Any], Any], seed: int
+) -> Measured:
     groups = [group for group in groups if group.size]
     if not groups:
         return Measured(np.nan, np.nan)

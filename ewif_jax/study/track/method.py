@@ -72,7 +72,7 @@ def method(arguments: argparse.Namespace, tracks: Tracks) -> Method:
             f"--lag: expected at most {max(longest, MOST_LAG)}, as the longest track has {longest} "
             f"measurements, got {arguments.lag}"
         )
-    noise, interval = _noise(arguments.noise, tracks.sensors), _interval(tracks)
+    noise, interval = _noise_of(arguments.noise, tracks.sensors), _median_interval(tracks)
     sensors = [models.position_sensor(s**2, dims) for s in noise]
     model = MODELS[arguments.model](sensors=sensors, q=lambda p: p["q"], dims=dims)
     estimator = BUILDERS[arguments.estimator](model, arguments.lag)
@@ -97,7 +97,7 @@ def method(arguments: argparse.Namespace, tracks: Tracks) -> Method:
     return Method(estimator, params, name, unit, transform, prior)
 
 
-def _noise(given: dict[str, float], sensors: list[str]) -> list[float]:
+def _noise_of(given: dict[str, float], sensors: list[str]) -> list[float]:
     if "" in given:
         return [given[""]] * len(sensors)
     missing = [name for name in sensors if name not in given]
@@ -106,7 +106,7 @@ def _noise(given: dict[str, float], sensors: list[str]) -> list[float]:
     return [given[name] for name in sensors]
 
 
-def _interval(tracks: Tracks) -> float:
+def _median_interval(tracks: Tracks) -> float:
     """The median time between measurements of a track, in seconds."""
     order = np.lexsort((tracks.time, tracks.row))
     steps = np.diff(tracks.time[order])[np.diff(tracks.row) == 0]

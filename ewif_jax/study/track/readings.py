@@ -101,7 +101,7 @@ def _read_columns(
     signs = np.ones((len(table.rows), len(columns.values)))
     if columns.geographic:
         for k, letters in enumerate((NORTH, EAST)):
-            cells[columns.values[k]], signs[:, k] = _hemispheres(table, columns, k, letters)
+            cells[columns.values[k]], signs[:, k] = _hemisphere_signs(table, columns, k, letters)
     value = np.column_stack([to_numbers(table, name, mark, cells[name]) for name in columns.values])
     if columns.geographic:
         _check_signs(table, columns, value, signs)
@@ -143,7 +143,7 @@ def _track_names(
     return names, columns
 
 
-def _hemispheres(
+def _hemisphere_signs(
     table: Table, columns: Columns, k: int, letters: dict[str, int]
 ) -> tuple[list[str], np.ndarray]:
     """Cells of degrees without their letter, and the signs (N,) that letters in or beside them say

@@ -74,15 +74,15 @@ def read_table(path: Path) -> Table:
     Raises:
         Refused: the file, and the line where there is one; see `readings.read`.
     """
-    lines = list(enumerate(_text(path).splitlines(), 1))
+    lines = list(enumerate(_file_text(path).splitlines(), 1))
     filled = [(n, line) for n, line in lines if line.strip()]
     if not filled:
         raise Refused(f"{path}: is empty")
     given = None
     if filled[0][1].lower().startswith("sep=") and len(filled[0][1].strip()) == 5:
         given, filled = filled[0][1].strip()[-1], filled[1:]
-    number, header, comments = _header(path, filled, given)
-    delimiter = given or _delimiter(header)
+    number, header, comments = _header_line(path, filled, given)
+    delimiter = given or _delimiter_of(header)
     names = [name.strip() for name in next(csv.reader([header], delimiter=delimiter))]
     if all(_is_number(name) for name in names):
         raise Refused(f"{path}, line {number}: expected names of columns, got numbers: {header!r}")
@@ -90,7 +90,7 @@ def read_table(path: Path) -> Table:
     skipped = {"comment lines": comments + sum(line.startswith("#") for _, line in body)}
     kept = [(n, line) for n, line in body if not line.startswith("#")]
     rows, starts, short = [], [], 0
-    for start, row in _records(path, kept, delimiter):
+    for start, row in _record_cells(path, kept, delimiter):
         cells = [cell.strip() for cell in row]
         while len(cells) > len(names) and not cells[-1]:
             cells.pop()
@@ -110,7 +110,7 @@ def read_table(path: Path) -> Table:
     return Table(path, names, rows, starts, delimiter, {k: n for k, n in skipped.items() if n})
 
 
-def _text(path: Path) -> str:
+def _file_text(path: Path) -> str:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -131,7 +131,9 @@ def _text(path: Path) -> str:
 _ENDS = str.maketrans(dict.fromkeys("\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029", " "))
 
 
-def _header(path: Path, filled: list[tuple[int, str]], given: str | None) -> tuple[int, str, int]:
+def _header_line(
+    path: Path, filled: list[tuple[int, str]], given: str | None
+) -> tuple[int, str, int]:
     """Line number and text of the header, and how many comment lines are above it."""
     comments = 0
     while comments < len(filled) and filled[comments][1].startswith("#"):
@@ -149,7 +151,7 @@ def _header(path: Path, filled: list[tuple[int, str]], given: str | None) -> tup
 
 def _names_columns(comment: str, data: str, given: str | None) -> bool:
     """Whether a comment is the header of a line of data."""
-    delimiter = given or _delimiter(comment)
+    delimiter = given or _delimiter_of(comment)
     names, cells = (next(csv.reader([text], delimiter=delimiter)) for text in (comment, data))
     return (
         len(names) == len(cells) > 1
@@ -158,11 +160,11 @@ def _names_columns(comment: str, data: str, given: str | None) -> bool:
     )
 
 
-def _delimiter(header: str) -> str:
+def _delimiter_of(header: str) -> str:
     return max(DELIMITERS, key=lambda mark: len(next(csv.reader([header], delimiter=mark))))
 
 
-def _records(
+def _record_cells(
     path: Path, lines: list[tuple[int, str]], delimiter: str
 ) -> Iterator[tuple[int, list[str]]]:
     """The line where each row begins, and its cells; a cell in quotes may go over several lines."""

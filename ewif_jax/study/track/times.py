@@ -75,7 +75,7 @@ def to_seconds(
     empty = next((row for row, cell in enumerate(cells) if is_missing(cell)), None)
     if empty is not None:
         raise table.refuse(empty, name, "a number", cells[empty])
-    if plain_number(cells[0], decimal) is None and _parts(cells[0]) is not None:
+    if plain_number(cells[0], decimal) is None and _date_parts(cells[0]) is not None:
         found = _from_dates(table, name, cells, dates)
     else:
         found = _from_numbers(table, name, cells, decimal)
@@ -97,15 +97,15 @@ def _from_numbers(table: Table, name: str, cells: Sequence[str], decimal: str) -
         raise table.refuse(row, name, f"{SCALES[kind][2]} as in other rows", cells[row])
     scale = SCALES[kind][1]
     if kind:  # whole numbers are divided exactly, which their floats are not
-        number = np.array([_divided(text or "0", int(scale)) for text in texts])
+        number = np.array([_divided_units(text or "0", int(scale)) for text in texts])
     return Times(number, SCALES[kind][2])
 
 
-def _divided(text: str, scale: int) -> float:
+def _divided_units(text: str, scale: int) -> float:
     return int(text) / scale if text.lstrip("+-").isdigit() else float(text) / scale
 
 
-def _parts(cell: str) -> re.Match[str] | None:
+def _date_parts(cell: str) -> re.Match[str] | None:
     kinds = (YEAR_FIRST, YEAR_LAST, MONTH_NAMED, COMPACT)
     return next((found for kind in kinds if (found := kind.fullmatch(cell))), None)
 
@@ -113,12 +113,12 @@ def _parts(cell: str) -> re.Match[str] | None:
 def _from_dates(table: Table, name: str, cells: Sequence[str], dates: str | None) -> Times:
     parts = []
     for row, cell in enumerate(cells):
-        found = _parts(cell)
+        found = _date_parts(cell)
         if found is None or found.re is not (parts[0].re if parts else found.re):
             like = "a date and time" + (f" like {cells[0]!r}" if parts else "")
             raise table.refuse(row, name, f"{like}, with a zone as Z or +01:00 if any", cell)
         parts.append(found)
-    order = _order(table, name, parts, dates) if parts[0].re is YEAR_LAST else "month-first"
+    order = _date_order(table, name, parts, dates) if parts[0].re is YEAR_LAST else "month-first"
     zoned = [bool(found["zone"]) for found in parts]
     if any(zoned) and not all(zoned):
         row = zoned.index(not zoned[0])
@@ -134,7 +134,7 @@ def _from_dates(table: Table, name: str, cells: Sequence[str], dates: str | None
     return Times(seconds, kind + (f", {order}" if parts[0].re is YEAR_LAST else ""))
 
 
-def _order(table: Table, name: str, parts: Sequence[re.Match[str]], given: str | None) -> str:
+def _date_order(table: Table, name: str, parts: Sequence[re.Match[str]], given: str | None) -> str:
     """What the dates of the file show together, never row by row."""
     day = next((row for row, found in enumerate(parts) if int(found["a"]) > 12), None)
     month = next((row for row, found in enumerate(parts) if int(found["b"]) > 12), None)
@@ -179,10 +179,10 @@ def _seconds_of(found: re.Match[str], order: str) -> float:
     second = float((found["s"] or "0").replace(",", "."))
     if hour > 23 or minute > 59 or not second < 61:
         raise ValueError("no such time of day")
-    return days * 86400.0 + hour * 3600 + minute * 60 + second - _offset(found["zone"])
+    return days * 86400.0 + hour * 3600 + minute * 60 + second - _zone_offset(found["zone"])
 
 
-def _offset(zone: str | None) -> float:
+def _zone_offset(zone: str | None) -> float:
     if zone is None or zone[0] not in "+-":
         return 0.0
     digits = zone[1:].replace(":", "").ljust(4, "0")

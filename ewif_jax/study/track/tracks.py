@@ -77,7 +77,9 @@ class Tracks(NamedTuple):
         """The opposite of `flat`: arrays (G, T, ...) with `fill` where nothing is (None: the last
         row of the track again)."""
         parts = np.split(rows, np.searchsorted(self.row, np.arange(1, len(self.name))))
-        return [_padded([parts[track] for track in group.tracks], fill) for group in self.groups]
+        return [
+            _padded_rows([parts[track] for track in group.tracks], fill) for group in self.groups
+        ]
 
 
 def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) -> Tracks:
@@ -115,7 +117,9 @@ def batch(readings: Readings, *, min_points: int = 1, drop_stale: bool = False) 
         raise Refused(f"no track has {min_points} distinct positions (--min-points)")
     sensors = sorted(kept["sensor"].unique())
     parts = list(kept.groupby("track", sort=True))
-    places = [_local(part[values].to_numpy(), readings.columns.geographic) for _, part in parts]
+    places = [
+        _local_metres(part[values].to_numpy(), readings.columns.geographic) for _, part in parts
+    ]
     start = np.array([part["time"].iloc[0] for _, part in parts])
     size = np.array([len(part) for _, part in parts])
     row = np.repeat(np.arange(len(parts)), size)
@@ -167,12 +171,12 @@ def _like_lengths(size: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _local(value: np.ndarray, geographic: bool) -> tuple[np.ndarray, np.ndarray]:
+def _local_metres(value: np.ndarray, geographic: bool) -> tuple[np.ndarray, np.ndarray]:
     """Metres east and north of the first position, and that position."""
     return (to_plane(value, value[0]) if geographic else value), value[0]
 
 
-def _padded(rows: list[np.ndarray], fill: float | bool | None = None) -> np.ndarray:
+def _padded_rows(rows: list[np.ndarray], fill: float | bool | None = None) -> np.ndarray:
     """Rows of different lengths as one array; `fill` None repeats the last entry."""
     longest = max(len(row) for row in rows)
 

@@ -54,7 +54,7 @@ def animation(
     moments = np.linspace(3.0, example["arrival"][-1], frames)
 
     def draw(moment: float) -> None:
-        _frame(ax, example, names, moment)
+        _draw_frame(ax, example, names, moment)
 
     def save(path: Path) -> None:
         FuncAnimation(figure, draw, frames=moments).save(path, PillowWriter(fps=8), dpi=70)
@@ -62,7 +62,7 @@ def animation(
     return save
 
 
-def _frame(ax: Axes, example: Mapping[str, Any], names: Sequence[str], moment: float) -> None:
+def _draw_frame(ax: Axes, example: Mapping[str, Any], names: Sequence[str], moment: float) -> None:
     ax.clear()
     ax.grid(alpha=0.25, linewidth=0.6)
     arrival = example["arrival"]

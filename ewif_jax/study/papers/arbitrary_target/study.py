@@ -40,10 +40,10 @@ def run(experiment: Experiment) -> None:
     squared = {}
     for i, name in enumerate(REGIMES):
         squared[name] = experiment.piece(
-            f"regime-{i}", lambda n=name: _errors(experiment, estimator, n, runs)
+            f"regime-{i}", lambda n=name: _squared_errors(experiment, estimator, n, runs)
         )
-    example = _example(experiment, estimator)
-    experiment.arrays("arbitrary_target", _dataset(squared, example))
+    example = _example_run(experiment, estimator)
+    experiment.arrays("arbitrary_target", _study_arrays(squared, example))
     experiment.figure("fig2", figures.snapshot(example, list(REGIMES)))
     with experiment.timed("animation"):
         frames = figures.animation(example, list(REGIMES), 5 if experiment.options.quick else 60)
@@ -94,7 +94,7 @@ def smoothed(key: jax.Array, runs: int, taus: np.ndarray) -> dict[str, np.ndarra
     return found
 
 
-def _errors(
+def _squared_errors(
     experiment: Experiment, estimator: Estimator, name: str, runs: int
 ) -> dict[str, np.ndarray]:
     scenario = arbitrary_target(*REGIMES[name])
@@ -110,7 +110,7 @@ def _errors(
         ).per_run
 
 
-def _example(experiment: Experiment, estimator: Estimator) -> dict[str, Any]:
+def _example_run(experiment: Experiment, estimator: Estimator) -> dict[str, Any]:
     """One realisation: measurements by sensor, report times, truth, and the four tracks."""
     found: dict[str, Any] = {}
     with experiment.timed("one realisation"):
@@ -135,7 +135,7 @@ def _example(experiment: Experiment, estimator: Estimator) -> dict[str, Any]:
     return found
 
 
-def _dataset(squared: dict[str, Any], example: dict[str, Any]) -> xr.Dataset:
+def _study_arrays(squared: dict[str, Any], example: dict[str, Any]) -> xr.Dataset:
     metres, names = {"units": "m"}, list(REGIMES)
     tracks = np.stack([example[name] for name in names])
 

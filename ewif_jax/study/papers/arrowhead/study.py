@@ -54,8 +54,10 @@ def run(experiment: Experiment) -> None:
     with experiment.timed("simulation"):
         batch = simulate_batch(scenario, jax.random.split(experiment.key(0), runs))
         lag = history_needed(batch.measurements)
-    found = experiment.piece("thresholds", lambda: _thresholds(experiment, scenario, batch, lag))
-    faded = experiment.piece("ewif", lambda: _ewif(experiment, scenario, batch))
+    found = experiment.piece(
+        "thresholds", lambda: _cutoff_thresholds(experiment, scenario, batch, lag)
+    )
+    faded = experiment.piece("ewif", lambda: _ewif_errors(experiment, scenario, batch))
     squared, taus = found["squared_error"], faded["tau"]
     lines = [
         ("KF, late measurements dropped", squared[0], found["late_used"][0]),
@@ -87,8 +89,8 @@ def run(experiment: Experiment) -> None:
         row({"cut-off [s]": float(c)}, mse, used)
         for c, mse, used in zip(cutoffs(), squared, found["late_used"], strict=True)
     ]
-    example = _example(experiment, scenario, lag, float(taus[1]))
-    experiment.arrays("arrowhead", _dataset(found, faded, example))
+    example = _example_laps(experiment, scenario, lag, float(taus[1]))
+    experiment.arrays("arrowhead", _arrowhead_arrays(found, faded, example))
     experiment.figure("path", arrowhead_figures.path(example))
     experiment.figure("cutoff", arrowhead_figures.cutoff(cutoffs(), squared, stale(), lines))
     experiment.figure("lag", arrowhead_figures.east_end(example))
@@ -102,7 +104,7 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _thresholds(
+def _cutoff_thresholds(
     experiment: Experiment, scenario: Scenario, batch: Simulation, lag: int
 ) -> dict[str, Any]:
     label = "Al1, all thresholds"
@@ -118,7 +120,7 @@ def _thresholds(
         )
 
 
-def _ewif(experiment: Experiment, scenario: Scenario, batch: Simulation) -> dict[str, Any]:
+def _ewif_errors(experiment: Experiment, scenario: Scenario, batch: Simulation) -> dict[str, Any]:
     """Errors with the tau of the Kalman filter's steady gain, and with the tau that gradient
     descent finds on other runs."""
     quick, label, estimator = experiment.options.quick, "EWIF: tuning", exponential()
@@ -137,7 +139,7 @@ def _ewif(experiment: Experiment, scenario: Scenario, batch: Simulation) -> dict
     return {"tau": taus, **scores}
 
 
-def _example(
+def _example_laps(
     experiment: Experiment, scenario: Scenario, lag: int, tau: float
 ) -> dict[str, np.ndarray]:
     """Three laps, tracked by each method: positions at the time of each report."""
@@ -158,7 +160,7 @@ def _example(
     return found
 
 
-def _dataset(found: PyTree, faded: Any, example: dict[str, np.ndarray]) -> xr.Dataset:
+def _arrowhead_arrays(found: PyTree, faded: Any, example: dict[str, np.ndarray]) -> xr.Dataset:
     values, errors = rmses(found["squared_error"])
     metres = {"units": "m"}
     at = {"cutoff": ("cutoff", cutoffs(), {"units": "s"})}

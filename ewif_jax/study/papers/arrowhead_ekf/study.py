@@ -32,7 +32,9 @@ def run(experiment: Experiment) -> None:
         batch = simulate_batch(scenario, jax.random.split(experiment.key(0), runs))
     refiltered = steps_again(np.asarray(batch.measurements.time), limits)
     found = [
-        experiment.piece(f"limit-{limit}", lambda x=limit: _limited(experiment, scenario, batch, x))
+        experiment.piece(
+            f"limit-{limit}", lambda x=limit: _limited_delay(experiment, scenario, batch, x)
+        )
         for limit in limits
     ]
     squared = np.stack([one["squared_error"] for one in found])
@@ -70,7 +72,7 @@ def run(experiment: Experiment) -> None:
             }
         ),
     )
-    experiment.figure("fig10", _figure(np.asarray(limits), squared, refiltered, seconds))
+    experiment.figure("fig10", _draw_figure(np.asarray(limits), squared, refiltered, seconds))
     experiment.table(
         "arrowhead_ekf",
         f"EKF with exact replay, {runs} runs of {steps} measurements",
@@ -102,7 +104,7 @@ def steps_again(times: np.ndarray, limits: tuple[float, ...]) -> np.ndarray:
     return found / times.shape[1]
 
 
-def _limited(
+def _limited_delay(
     experiment: Experiment, scenario: Any, batch: Simulation, limit: float
 ) -> dict[str, Any]:
     """One maximum delay, with a buffer that just covers it; the time is the best of three."""
@@ -135,7 +137,7 @@ def _limited(
     return {**first, "slots": slots, "seconds": min(times)}
 
 
-def _figure(
+def _draw_figure(
     limits: np.ndarray, squared: np.ndarray, refiltered: np.ndarray, seconds: np.ndarray
 ) -> Any:
     figure, axes = canvas(1, 2, width=11, height=4.2)

@@ -107,11 +107,11 @@ def run(experiment: Experiment) -> None:
         for push, remedy in cases
         if remedy != "none"
     }
-    experiment.arrays("divergence", _dataset(time, found, exact, final))
+    experiment.arrays("divergence", _divergence_arrays(time, found, exact, final))
     experiment.figure("divergence", figures.growth(time, found, exact, TEXT))
     experiment.figure("settings", figures.settings(GAINS, final, exact, np.sqrt(EPS), TEXT))
     forms = closed_forms(dt)
-    rows = [_row(case, found[case], exact[case], forms[case], dt) for case in cases]
+    rows = [_claim_row(case, found[case], exact[case], forms[case], dt) for case in cases]
     printed = 1 / (LENGTH + 1) + EPS * (LENGTH + 1) / 2
     unremedied = rows[cases.index(("constant", "none"))]["simulated"]
     off = (unremedied.value - printed) / unremedied.error
@@ -131,7 +131,7 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _row(
+def _claim_row(
     case: tuple[Push, Remedy], one: Arrays, exact: np.ndarray, form: tuple[str, float], dt: float
 ) -> dict[str, Any]:
     push, remedy = case
@@ -148,7 +148,9 @@ def _row(
     }
 
 
-def _dataset(time: np.ndarray, found: PyTree, exact: Numbers, final: Numbers) -> xr.Dataset:
+def _divergence_arrays(
+    time: np.ndarray, found: PyTree, exact: Numbers, final: Numbers
+) -> xr.Dataset:
     def stacked(x: Numbers, names: tuple[str, ...], last: str) -> xr.DataArray:
         table = np.stack([[x[push, name] for name in names] for push in PUSHES])
         return xr.DataArray(

@@ -96,8 +96,8 @@ def run(experiment: Experiment) -> None:
             ages, gains = actual(case, keys)
             theory = closed_form(case, ages)
         found[case.name] = (case, ages, gains)
-        rows += _rows(case, ages, gains, theory)
-        arrays |= _arrays(case, ages, gains, theory)
+        rows += _gain_rows(case, ages, gains, theory)
+        arrays |= _gain_arrays(case, ages, gains, theory)
     experiment.arrays("gains", xr.Dataset(arrays))
     draw = {"fig1": figures.low, "fig2": figures.typical, "fig3": figures.velocity}
     for name, (case, ages, gains) in found.items():
@@ -126,7 +126,7 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _rows(case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray) -> list[dict]:
+def _gain_rows(case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray) -> list[dict]:
     rows = []
     for i, component in enumerate(case.components):
         row: dict[str, Any] = {
@@ -142,16 +142,16 @@ def _rows(case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray) -
             else:
                 row[f"ratio, {age} back"] = None
         difference = np.sqrt(np.mean((gains[..., i] - theory[..., i]) ** 2, 1))
-        row["rms difference / fresh"] = _over(mean_of(difference), theory[0, 0, i])
+        row["rms difference / fresh"] = _over_scale(mean_of(difference), theory[0, 0, i])
         rows.append(row)
     return rows
 
 
-def _over(measured: Measured, scale: float) -> Measured:
+def _over_scale(measured: Measured, scale: float) -> Measured:
     return Measured(measured.value / scale, measured.error / scale)
 
 
-def _arrays(
+def _gain_arrays(
     case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray
 ) -> dict[str, xr.DataArray]:
     back, name = f"{case.name}_back", case.name

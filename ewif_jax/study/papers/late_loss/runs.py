@@ -36,12 +36,12 @@ def arrivals(lag: int) -> np.ndarray:
 def responses(estimator: Estimator, n: int, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How the last estimate of a linear filter depends on the measured numbers (V, n, T), and its
     computed covariance (V, n, n), for V streams of times (V, T) and a prior N(0, I) at 0."""
-    response, cov = _responses(estimator, n, times)
+    response, cov = _impulse_responses(estimator, n, times)
     return np.asarray(response), np.asarray(cov)
 
 
 @partial(jax.jit, static_argnames=("estimator", "n"))
-def _responses(estimator: Estimator, n: int, times: Array) -> tuple[Array, Array]:
+def _impulse_responses(estimator: Estimator, n: int, times: Array) -> tuple[Array, Array]:
     prior = Gaussian(jnp.zeros(n), jnp.eye(n))
 
     def last(values: Array, time: Array) -> tuple[Array, Array]:
@@ -86,9 +86,10 @@ def relative_errors() -> list[dict[str, Any]]:
         for i, lag in enumerate(LAGS):
             state, seen = sources(model, n, times[i])
             true = {
-                name: _square(state - response[i] @ seen) for name, (response, _) in found.items()
+                name: _expected_square(state - response[i] @ seen)
+                for name, (response, _) in found.items()
             }
-            exact, dropped = _best(state, seen), _best(state, seen[:-1])
+            exact, dropped = _best_square(state, seen), _best_square(state, seen[:-1])
             rows.append(
                 {
                     "motion": motion,
@@ -101,12 +102,12 @@ def relative_errors() -> list[dict[str, Any]]:
     return rows
 
 
-def _square(error: np.ndarray) -> float:
+def _expected_square(error: np.ndarray) -> float:
     """Expected square of the first component of an error (n, S)."""
     return float(error[0] @ error[0])
 
 
-def _best(state: np.ndarray, seen: np.ndarray) -> float:
+def _best_square(state: np.ndarray, seen: np.ndarray) -> float:
     """That of the best linear estimate, which is the exact one."""
     weights = np.linalg.solve(seen @ seen.T, seen @ state.T).T
-    return _square(state - weights @ seen)
+    return _expected_square(state - weights @ seen)

@@ -73,13 +73,14 @@ def run(experiment: Experiment) -> None:
     quick = experiment.options.quick
     steps, runs = 500 if quick else 5000, experiment.size(40, 4)
     few = experiment.options.runs or (2 if quick else 10)
-    compared = experiment.piece("compared", lambda: _compared(experiment, runs, steps))
+    compared = experiment.piece("compared", lambda: _compared_methods(experiment, runs, steps))
     swept = experiment.piece(
-        "swept", lambda: _by_cutoff(experiment, SWEPT, _simulated(experiment, SWEPT, few, steps, 2))
+        "swept",
+        lambda: _by_cutoff(experiment, SWEPT, _simulated_cases(experiment, SWEPT, few, steps, 2)),
     )
     found = [{name: x[..., i, :] for name, x in compared.items()} for i in range(len(CASES))]
     panels = swept["squared_error"].reshape(MULTIPLES.size, len(SIGMAS), DELAYS.size, few)
-    experiment.arrays("random_walk", _dataset(compared, panels))
+    experiment.arrays("random_walk", _walk_arrays(compared, panels))
     experiment.figure("fig4", figures.methods(CASES, found, theoretical, MULTIPLES))
     for name, wide in (("fig5", False), ("fig6", True)):
         drawn = figures.delays(panels, SIGMAS, DELAYS, theoretical, MULTIPLES, wide)
@@ -87,18 +88,21 @@ def run(experiment: Experiment) -> None:
     experiment.table(
         "delays",
         f"By mean delay, {few} runs of {steps} measurements: RMSE [m]",
-        [_row(case, swept["squared_error"][:, i]) for i, case in enumerate(SWEPT)],
+        [_case_row(case, swept["squared_error"][:, i]) for i, case in enumerate(SWEPT)],
         ["Where dropping costs less than 2 % of the RMSE there is nothing to recover."],
     )
     experiment.table(
         "cutoff",
         "How far the theoretical cut-off goes from drop to Al1",
-        [_recovery(case, one["squared_error"]) for case, one in zip(CASES, found, strict=True)],
+        [
+            _recovery_ratio(case, one["squared_error"])
+            for case, one in zip(CASES, found, strict=True)
+        ],
     )
     experiment.table(
         "random_walk",
         f"Random walk, {runs} runs of {steps} measurements: RMSE [m]",
-        [_methods(case, one) for case, one in zip(CASES, found, strict=True)],
+        [_methods_of(case, one) for case, one in zip(CASES, found, strict=True)],
         [
             "exact: all measurements in order of validity time, at a part of the arrivals.",
             "EWIF: all measurements, τ by gradient on other runs, start of the walk not told.",
@@ -109,7 +113,7 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _simulated(
+def _simulated_cases(
     experiment: Experiment, cases: Sequence[Case], runs: int, steps: int, number: int
 ) -> Simulation:
     """`runs` runs of each case, one case after the other."""
@@ -149,9 +153,9 @@ def _by_cutoff(
     return {name: x.reshape(-1, len(cases), runs) for name, x in found.items()}
 
 
-def _compared(experiment: Experiment, runs: int, steps: int) -> dict[str, np.ndarray]:
+def _compared_methods(experiment: Experiment, runs: int, steps: int) -> dict[str, np.ndarray]:
     """All methods on the same runs of the three cases of Fig. 4; arrays end in (C, R)."""
-    batch = _simulated(experiment, CASES, runs, steps, 0)
+    batch = _simulated_cases(experiment, CASES, runs, steps, 0)
     found = _by_cutoff(experiment, CASES, batch)
     exact = []
     with experiment.timed("exact"):
@@ -161,9 +165,9 @@ def _compared(experiment: Experiment, runs: int, steps: int) -> dict[str, np.nda
             model = random_walk_model(case.sigma**2, VARIANCE)
             exact.append(exact_late(model, random_walk(), own, window))
     estimator = ewif(random_walk_model(0.0, VARIANCE), tau=lambda p: p["tau"])
-    same = np.asarray([-INTERVAL / np.log1p(-_gain(case)) for case in CASES])
+    same = np.asarray([-INTERVAL / np.log1p(-_steady_gain(case)) for case in CASES])
     few, label = 4 if experiment.options.quick else 16, "EWIF: tuning"
-    seen = _simulated(experiment, CASES, few, steps, 1)
+    seen = _simulated_cases(experiment, CASES, few, steps, 1)
 
     def loss(params: dict[str, Array]) -> Array:
         errors = scored(
@@ -193,11 +197,11 @@ def _compared(experiment: Experiment, runs: int, steps: int) -> dict[str, np.nda
     }
 
 
-def _gain(case: Case) -> float:
+def _steady_gain(case: Case) -> float:
     return float(random_walk_gain(maneuvering_index(case.sigma**2, VARIANCE, INTERVAL)))
 
 
-def _methods(case: Case, found: PyTree) -> dict[str, Any]:
+def _methods_of(case: Case, found: PyTree) -> dict[str, Any]:
     squared = found["squared_error"]
     return {
         "": case.name,
@@ -214,7 +218,7 @@ def _methods(case: Case, found: PyTree) -> dict[str, Any]:
     }
 
 
-def _recovery(case: Case, squared: np.ndarray) -> dict[str, Any]:
+def _recovery_ratio(case: Case, squared: np.ndarray) -> dict[str, Any]:
     share = recovered(squared)
     return {
         "": case.name,
@@ -228,7 +232,7 @@ def _recovery(case: Case, squared: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _row(case: Case, squared: np.ndarray) -> dict[str, Any]:
+def _case_row(case: Case, squared: np.ndarray) -> dict[str, Any]:
     share, values = recovered(squared), rmses(squared)[0]
     counts = values[0] > 1.02 * values[-1]
     return {
@@ -244,7 +248,7 @@ def _row(case: Case, squared: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _dataset(compared: dict[str, np.ndarray], panels: np.ndarray) -> xr.Dataset:
+def _walk_arrays(compared: dict[str, np.ndarray], panels: np.ndarray) -> xr.Dataset:
     metres, seconds = {"units": "m"}, {"units": "s"}
     multiple = {"cutoff_multiple": MULTIPLES}
     case = {"case": [c.name for c in CASES]}

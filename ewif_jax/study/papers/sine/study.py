@@ -96,30 +96,30 @@ def run(experiment: Experiment) -> None:
     found, series, rows, notes = {}, {}, [], []
     pair = filters()
     for one in pair:
-        tuned = experiment.piece(f"{one.name}-tuned", lambda f=one: _tuned(experiment, f))
+        tuned = experiment.piece(f"{one.name}-tuned", lambda f=one: _tuned_settings(experiment, f))
         measured = experiment.piece(
-            f"{one.name}-measured", lambda f=one, t=tuned: _measured(experiment, f, t)
+            f"{one.name}-measured", lambda f=one, t=tuned: _measured_errors(experiment, f, t)
         )
         found[one.name] = (one, tuned | measured)
-        series |= _labelled(one, found[one.name][1])
-        rows += _rows(one, found[one.name][1])
+        series |= _labelled_arrays(one, found[one.name][1])
+        rows += _setting_rows(one, found[one.name][1])
         notes += [
             f"{one.name}: the gradient of the exact error leads from {start} to {end:.4f}"
             for start, end in zip(one.starts, tuned["optimum"], strict=True)
         ]
-    example = _example(experiment, pair)
-    notes += _equivalent(experiment, pair[0], float(found["KF"][1]["exact"][0]))
+    example = _example_track(experiment, pair)
+    notes += _equivalent_tau(experiment, pair[0], float(found["KF"][1]["exact"][0]))
     experiment.arrays("sine", xr.Dataset({**series, **example}))
     experiment.figure("tracks", sine_figures.tracks(example))
     experiment.figure("rmse", sine_figures.curves(found))
     experiment.figure("tuning", sine_figures.histories(found))
     runs = experiment.size(10_000, 500)
-    _smoothers(experiment)
+    _smoother_table(experiment)
     experiment.table("sine", f"Sine: {runs} runs of 101 samples, RMSE in m", rows, notes)
     experiment.finish()
 
 
-def _smoothers(experiment: Experiment) -> None:
+def _smoother_table(experiment: Experiment) -> None:
     """A table of the filter, its fixed lag and the two-sided estimate."""
     runs = experiment.size(2000, 200)
     taus = np.asarray([0.2, 0.3, 0.4, PUBLISHED_TAU, 0.6, 0.8, 1.0, 1.3])
@@ -146,7 +146,7 @@ DESCENT: Any = {"method": "adam", "transforms": positive()}
 """Small steps, which make a path to draw; sigma_w counts squared, so its sign is not found."""
 
 
-def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
+def _tuned_settings(experiment: Experiment, one: Filter) -> dict[str, Any]:
     """Gradient descent on a training batch, and on the exact error from both starts at once: the
     loss is their mean and the optimizer treats each number by itself, so neither sees the other."""
     quick = experiment.options.quick
@@ -177,7 +177,7 @@ def _tuned(experiment: Experiment, one: Filter) -> dict[str, Any]:
     }
 
 
-def _measured(experiment: Experiment, one: Filter, tuned: Arrays) -> dict[str, Any]:
+def _measured_errors(experiment: Experiment, one: Filter, tuned: Arrays) -> dict[str, Any]:
     """RMSE of the three settings and along the curve, on runs that the tuning has not seen, and
     the exact RMSE there and along the descents."""
     grid = np.geomspace(*one.span, 5 if experiment.options.quick else 9)
@@ -216,7 +216,7 @@ def _measured(experiment: Experiment, one: Filter, tuned: Arrays) -> dict[str, A
     }
 
 
-def _rows(one: Filter, found: Arrays) -> list[dict[str, Any]]:
+def _setting_rows(one: Filter, found: Arrays) -> list[dict[str, Any]]:
     low, high = np.quantile(found["single"], [0.05, 0.95], axis=1)
     return [
         {
@@ -233,7 +233,7 @@ def _rows(one: Filter, found: Arrays) -> list[dict[str, Any]]:
     ]
 
 
-def _example(experiment: Experiment, pair: tuple[Filter, Filter]) -> dict[str, xr.DataArray]:
+def _example_track(experiment: Experiment, pair: tuple[Filter, Filter]) -> dict[str, xr.DataArray]:
     """One realisation, filtered with the published settings."""
     with experiment.timed("one realisation"):
         seen, truth, _ = sine(dt=DT, r=VARIANCE).simulate(experiment.key(3))
@@ -248,7 +248,7 @@ def _example(experiment: Experiment, pair: tuple[Filter, Filter]) -> dict[str, x
     }
 
 
-def _equivalent(experiment: Experiment, exponential: Filter, rmse: float) -> list[str]:
+def _equivalent_tau(experiment: Experiment, exponential: Filter, rmse: float) -> list[str]:
     """The tau that behaves like the published process noise: by equal steady gain, and by equal
     expected RMSE (the root nearby, on the rising side of the curve)."""
     params = {"sigma_w": PUBLISHED_NOISE}
@@ -274,7 +274,7 @@ def _equivalent(experiment: Experiment, exponential: Filter, rmse: float) -> lis
     ]
 
 
-def _labelled(one: Filter, found: Arrays) -> dict[str, xr.DataArray]:
+def _labelled_arrays(one: Filter, found: Arrays) -> dict[str, xr.DataArray]:
     """What was found for one filter, as labelled arrays."""
     name, rmse = one.name, {"units": "m", "long_name": f"{one.name} RMSE"}
     given = {"units": one.unit, "long_name": one.parameter}

@@ -75,14 +75,14 @@ def run(experiment: Experiment) -> None:
     for one in methods():
         prior = scenario.prior if one.prior else None
         found = experiment.piece(
-            one.name, lambda m=one, p=prior: _found(experiment, m, lag, seen, batch, p)
+            one.name, lambda m=one, p=prior: _found_optimum(experiment, m, lag, seen, batch, p)
         )
-        rows += _rows(one, found)
-        arrays |= _arrays(one, found)
+        rows += _optimum_rows(one, found)
+        arrays |= _optimum_arrays(one, found)
         drawn.append((one, found))
     experiment.arrays("tuning_under_delay", xr.Dataset(arrays))
-    experiment.figure("landscape", _landscape(drawn))
-    experiment.figure("descent", _descent(drawn))
+    experiment.figure("landscape", _draw_landscape(drawn))
+    experiment.figure("descent", _draw_descent(drawn))
     experiment.table(
         "tuning_under_delay",
         f"Arrowhead, tuned through late measurements, {runs} test runs of {steps}",
@@ -98,7 +98,7 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _found(
+def _found_optimum(
     experiment: Experiment,
     one: Method,
     lag: int,
@@ -108,7 +108,7 @@ def _found(
 ) -> dict[str, Any]:
     setting = {"prior": prior, "t0": 0.0}
     soft, hard = one.build(lag, SOFTNESS), one.build(lag, None)
-    tuned = _tuned(experiment, one, soft, seen, setting)
+    tuned = _tuned_cutoff(experiment, one, soft, seen, setting)
     learned = {name: float(value) for name, value in tuned.params.items()}
     cut = stale() if one.name == "Al1" else np.inf
     pairs = [(one.published, cut), (learned[one.parameter], learned["cutoff"])]
@@ -134,7 +134,7 @@ def _found(
     }
 
 
-def _tuned(
+def _tuned_cutoff(
     experiment: Experiment, one: Method, soft: Estimator, seen: Simulation, setting: Any
 ) -> Tuned:
     label = f"{one.name}: tuning"
@@ -145,7 +145,7 @@ def _tuned(
         return tune(loss, start, method="adam", steps=steps, progress=report)
 
 
-def _rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
+def _optimum_rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
     squared, values, cutoffs = found["squared"], found["parameter"], found["cutoff"]
     best = 2 + int(np.argmin(squared[2:].mean(1)))
     picked = [
@@ -169,7 +169,7 @@ def _rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
     ]
 
 
-def _arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
+def _optimum_arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
     name, metres = one.name, {"units": "m"}
     grid = found["squared"][2:].reshape(one.grid.size, CUTOFFS.size, -1)
     return {
@@ -185,7 +185,7 @@ def _arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
             coords={"setting": ["published", "learned, hard", "learned, soft"]},
             attrs=metres,
         ),
-        f"{name}_descent": xr.DataArray(
+        f"{name}_draw_descent": xr.DataArray(
             found["descent"],
             dims=(f"{name}_component", "step"),
             coords={f"{name}_component": [one.parameter, "cutoff"]},
@@ -194,7 +194,7 @@ def _arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
     }
 
 
-def _landscape(drawn: list[tuple[Method, Any]]) -> Figure:
+def _draw_landscape(drawn: list[tuple[Method, Any]]) -> Figure:
     """RMSE over the grid, the way of the descent, and where it ends."""
     figure, axes = canvas(1, 2, width=12, height=4.8)
     shown = np.isfinite(CUTOFFS)
@@ -221,7 +221,7 @@ def _landscape(drawn: list[tuple[Method, Any]]) -> Figure:
     return figure
 
 
-def _descent(drawn: list[tuple[Method, Any]]) -> Figure:
+def _draw_descent(drawn: list[tuple[Method, Any]]) -> Figure:
     """Parameter, cut-off and loss, gradient step by gradient step."""
     figure, axes = canvas(1, 3, width=13, height=3.8)
     colors = {"Al1": OTHER, "EWIF": EWIF}

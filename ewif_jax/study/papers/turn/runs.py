@@ -84,7 +84,7 @@ def followed(method: Method, batch: Simulation, keys: RandomKey) -> Arrays:
     """Of every run (R,) of a batch in the order that the method asks for: the track (R, 31, 2),
     squared errors of position and velocity (R, 31) at each second, counts of what became of the
     measurements, and core_seconds."""
-    return _tracker(method.estimator, method.in_order)(batch, keys)
+    return _turn_tracker(method.estimator, method.in_order)(batch, keys)
 
 
 def bounds(batch: Simulation) -> Arrays:
@@ -126,12 +126,12 @@ def _as_printed() -> bool:
 
 
 @cache
-def _tracker(estimator: Estimator, in_order: bool) -> Callable[..., Arrays]:
+def _turn_tracker(estimator: Estimator, in_order: bool) -> Callable[..., Arrays]:
     """Compiled once for all methods that are the same filter."""
-    return tracker(estimator, turn(in_order=in_order), _observe(0 if in_order else 1))
+    return tracker(estimator, turn(in_order=in_order), _turn_observer(0 if in_order else 1))
 
 
-def _observe(marker: int) -> Callable[[Trace, Simulation], dict[str, Any]]:
+def _turn_observer(marker: int) -> Callable[[Trace, Simulation], dict[str, Any]]:
     """What to keep of a run: at each second, after the arrival of sensor `marker`."""
 
     def observe(trace: Trace, simulation: Simulation) -> dict[str, Any]:

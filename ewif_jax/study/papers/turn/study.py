@@ -38,14 +38,14 @@ def run(experiment: Experiment) -> None:
     with experiment.timed("simulation"):
         worlds = runs_of.simulated(experiment.key(0), runs)
     found = {
-        name: _tracked(experiment, i, name, method, worlds[method.in_order])
+        name: _tracked_runs(experiment, i, name, method, worlds[method.in_order])
         for i, (name, method) in enumerate(used.items())
     }
     some = jax.tree.map(lambda x: x[:100], worlds[False])
     with experiment.timed("bounds"):
         bound = experiment.piece("bounds", lambda: runs_of.bounds(some))
     held = {name: storage(method.estimator, 5).numbers for name, method in used.items()}
-    experiment.arrays("turn", _dataset(found, bound, held))
+    experiment.arrays("turn", _turn_arrays(found, bound, held))
     experiment.figure("tracks", figures.tracks(found))
     for number, kind in ((3, "position"), (4, "velocity")):
         experiment.figure(f"fig{number}_{kind}", figures.rms(found, bound, kind))
@@ -58,7 +58,7 @@ def run(experiment: Experiment) -> None:
     experiment.table(
         "turn",
         f"Coordinated turn, {runs} runs, t >= {SETTLED} s",
-        _rows(found, held),
+        _turn_rows(found, held),
         [
             f"{EXACT}: of {found[EXACT]['position'].shape[0]} runs, relative to {EKS} on the same.",
             "s/run: on one core, one run after the other, without compiling.",
@@ -94,7 +94,7 @@ def overall(found: dict[str, Arrays], kind: str = "position") -> dict[str, Measu
     return errors
 
 
-def _tracked(
+def _tracked_runs(
     experiment: Experiment,
     number: int,
     name: str,
@@ -120,7 +120,7 @@ def _tracked(
     return {key: np.concatenate([part[key] for part in found]) for key in found[0]}
 
 
-def _rows(found: dict[str, Arrays], held: dict[str, int]) -> list[dict[str, Any]]:
+def _turn_rows(found: dict[str, Arrays], held: dict[str, int]) -> list[dict[str, Any]]:
     position, velocity = overall(found), overall(found, "velocity")
     return [
         {
@@ -136,7 +136,7 @@ def _rows(found: dict[str, Arrays], held: dict[str, int]) -> list[dict[str, Any]
     ]
 
 
-def _dataset(found: dict[str, Arrays], bound: Arrays, held: dict[str, int]) -> xr.Dataset:
+def _turn_arrays(found: dict[str, Arrays], bound: Arrays, held: dict[str, int]) -> xr.Dataset:
     names, fields = list(found), {}
     for kind, units in (("position", "m"), ("velocity", "m/s")):
         for name, one in found.items():

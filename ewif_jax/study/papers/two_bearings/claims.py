@@ -53,12 +53,12 @@ Decider = Callable[[Evidence], tuple[Measured, int | None]]
 
 def squared(error: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Mean squared position error (D, R) after the filters have settled."""
-    return _settled(np.sum(error**2, -1), times)
+    return _settled_means(np.sum(error**2, -1), times)
 
 
 def reported(variance: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Mean standard deviation of the position (D, R) after the filters have settled."""
-    return _settled(np.sqrt(np.sum(variance, -1)), times)
+    return _settled_means(np.sqrt(np.sum(variance, -1)), times)
 
 
 def lost(error: np.ndarray) -> np.ndarray:
@@ -189,6 +189,6 @@ def claims(found: dict[str, Arrays], bound: Arrays, times: np.ndarray) -> list[d
     return rows
 
 
-def _settled(values: np.ndarray, times: np.ndarray) -> np.ndarray:
+def _settled_means(values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Means over the arrivals of (D, R, T) from 20 s on."""
     return np.stack([x[:, t >= SETTLED].mean(1) for x, t in zip(values, times, strict=True)])

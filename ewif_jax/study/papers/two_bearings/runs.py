@@ -82,7 +82,7 @@ def simulated(key: RandomKey, runs: int) -> World:
         for x in batches
     ]
     together = jax.tree.map(
-        lambda *x: np.concatenate(x), *(_padded(batch, longest) for batch in batches)
+        lambda *x: np.concatenate(x), *(_padded_batch(batch, longest) for batch in batches)
     )
     return World(together, jnp.concatenate([keys] * len(DELAYS)), np.stack(times))
 
@@ -95,7 +95,7 @@ def followed(method: Method, world: World, key: RandomKey) -> Arrays:
         stream = batch.measurements
         heard = (stream.sensor == method.sensor)[..., None]
         batch = batch._replace(measurements=stream._replace(mask=stream.mask & heard))
-    follow = _tracker(method.estimator, method.clock)
+    follow = _bearings_tracker(method.estimator, method.clock)
     found = follow(batch, jax.random.split(key, world.keys.shape[0]))
     return {name: x.reshape(len(DELAYS), -1, *x.shape[1:]) for name, x in found.items()}
 
@@ -103,7 +103,7 @@ def followed(method: Method, world: World, key: RandomKey) -> Arrays:
 def bounds(world: World) -> Arrays:
     """Variances of x and y (D, R, T, 2) that no filter can beat ("right"), and those that the paper
     prints ("published")."""
-    prior, model = _scenario().prior, two_bearings_model()
+    prior, model = _bearings_scenario().prior, two_bearings_model()
     assert prior is not None
     setting = {"start": np.asarray(START), "prior_cov": prior.cov, "t0": 0.0}
 
@@ -113,37 +113,37 @@ def bounds(world: World) -> Arrays:
         right = pcrlb_late(model, None, stream, seen, **setting, times=times)
         printed = pcrlb_equivalent(model, None, stream, now, **setting, times=times)
         pair = (("right", right), ("published", printed))
-        return {name: _variances(x) + 0 * truth for name, x in pair}
+        return {name: _position_variances(x) + 0 * truth for name, x in pair}
 
     found = over_cores(along)(world.keys, world.batch)
     return {name: x.reshape(len(DELAYS), -1, *x.shape[1:]) for name, x in found.items()}
 
 
 @cache
-def _tracker(estimator: Estimator, clock: Clock) -> Any:
+def _bearings_tracker(estimator: Estimator, clock: Clock) -> Any:
     """Compiled once for all methods that are the same filter."""
-    return tracker(estimator, _scenario(), _observe, clock)
+    return tracker(estimator, _bearings_scenario(), _observe_track, clock)
 
 
-def _scenario() -> Scenario:
+def _bearings_scenario() -> Scenario:
     """Prior and clock, which do not depend on the delay."""
     return two_bearings()
 
 
-def _observe(trace: Trace, simulation: Simulation) -> dict[str, Any]:
+def _observe_track(trace: Trace, simulation: Simulation) -> dict[str, Any]:
     truth = simulation.truth
     return {
         "error": trace.mean[:, :2] - truth,
-        "variance": _variances(trace.cov) + 0 * truth,
+        "variance": _position_variances(trace.cov) + 0 * truth,
     }
 
 
-def _variances(cov: Numbers) -> Any:
+def _position_variances(cov: Numbers) -> Any:
     """Of x and y (T, 2)."""
     return jnp.stack([cov[:, 0, 0], cov[:, 1, 1]], -1)
 
 
-def _padded(batch: Simulation, length: int) -> Simulation:
+def _padded_batch(batch: Simulation, length: int) -> Simulation:
     """More rows that say nothing, at the time of the last one; truth is NaN there."""
     more = length - batch.truth.shape[1]
 

@@ -32,7 +32,9 @@ def run(experiment: Experiment) -> None:
     with experiment.timed("simulation"):
         world = runs_of.simulated(experiment.key(0), runs)
     found = {
-        name: experiment.piece(f"filter-{i}", partial(_timed, experiment, name, method, world))
+        name: experiment.piece(
+            f"filter-{i}", partial(_timed_filter, experiment, name, method, world)
+        )
         for i, (name, method) in enumerate(used.items())
     }
     with experiment.timed("bounds"):
@@ -42,13 +44,13 @@ def run(experiment: Experiment) -> None:
         stem = f"delay_{delay:g}s"
         experiment.figure(f"{stem}_tracks", figures.tracks(found, truth[k, 0], k, delay))
         experiment.figure(f"{stem}_errors", figures.errors(found, bound, world.times[k], k, delay))
-    experiment.figure("delays", figures.by_delay(*_summary(found, bound, world.times), DELAYS))
-    experiment.arrays("two_bearings", _dataset(found, bound, world.times))
+    experiment.figure("delays", figures.by_delay(*_mean_squares(found, bound, world.times), DELAYS))
+    experiment.arrays("two_bearings", _bearings_arrays(found, bound, world.times))
     experiment.table("storage", f"Storage, lag {LAG}", storage_rows(4, 1, lag=LAG, members=MEMBERS))
     experiment.table(
         "two_bearings",
         f"Two bearings, {runs} runs, t >= {SETTLED:g} s",
-        _rows(found, bound, world.times, used),
+        _filter_rows(found, bound, world.times, used),
         [
             f"lost: share of runs that are ever more than {LOST:g} m off; a RMSE with lost runs in",
             "it says little. s/run: on one core, one run after the other, without compiling.",
@@ -67,12 +69,12 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _timed(experiment: Experiment, name: str, method: Method, world: World) -> Arrays:
+def _timed_filter(experiment: Experiment, name: str, method: Method, world: World) -> Arrays:
     with experiment.timed(name):
         return runs_of.followed(method, world, experiment.key(1))
 
 
-def _summary(
+def _mean_squares(
     found: dict[str, Arrays], bound: Arrays, times: np.ndarray
 ) -> tuple[dict[str, Any], Any, dict[str, Any]]:
     """Mean squares (D, R) by filter and of the bound, and which runs are lost."""
@@ -81,10 +83,10 @@ def _summary(
     return off, floor, {name: lost(one["error"]) for name, one in found.items()}
 
 
-def _rows(
+def _filter_rows(
     found: dict[str, Arrays], bound: Arrays, times: np.ndarray, used: dict[str, Method]
 ) -> list[dict[str, Any]]:
-    off, _, gone = _summary(found, bound, times)
+    off, _, gone = _mean_squares(found, bound, times)
     rows: list[dict[str, Any]] = []
     for k, delay in enumerate(DELAYS):
         for name, method in used.items():
@@ -107,7 +109,7 @@ def _rows(
     return rows
 
 
-def _dataset(found: dict[str, Arrays], bound: Arrays, times: np.ndarray) -> xr.Dataset:
+def _bearings_arrays(found: dict[str, Arrays], bound: Arrays, times: np.ndarray) -> xr.Dataset:
     dims, metres = ("estimator", "delay", "run", "arrival", "axis"), {"units": "m"}
 
     def stacked(values: list[np.ndarray]) -> xr.DataArray:

@@ -35,14 +35,14 @@ def two_sided_errors(
         some = slice(k, k + chunk)
         part = [x[some] if own else x for x, own in zip(batch.measurements, spread, strict=True)]
         times = report[some] if report.ndim == 2 else report
-        means = _means(model, jnp.asarray(tau), Measurement(*part), times)
+        means = _smoothed_means(model, jnp.asarray(tau), Measurement(*part), times)
         exact = truth[some] if truth.ndim == 3 else truth
         found.append(_mean_square(np.asarray(means), exact))
     return np.concatenate(found)
 
 
 @partial(jax.jit, static_argnames="model")
-def _means(model: Model, tau: Array, measurements: Measurement, times: Array) -> Array:
+def _smoothed_means(model: Model, tau: Array, measurements: Measurement, times: Array) -> Array:
     """Estimates (R, K, n) at `times` (K,) or (R, K)."""
     own = [x.ndim > rank for x, rank in zip(measurements, RANKS, strict=True)]
     axes: Any = Measurement(*(0 if each else None for each in own))  # type: ignore[arg-type]
