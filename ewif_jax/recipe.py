@@ -60,7 +60,7 @@ class FromRecipe:
         recipe = self.recipe
         if recipe is None:
             return type(self), tuple(self)  # pyright: ignore
-        return _built, (recipe.builder, recipe.args, recipe.kwargs)
+        return _built_again, (recipe.builder, recipe.args, recipe.kwargs)
 
     def __copy__(self: Made) -> Made:
         return self
@@ -96,7 +96,7 @@ def from_recipe(builder: Callable[Given, Made]) -> Callable[Given, Made]:
     return build
 
 
-def _built(builder: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def _built_again(builder: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     return builder(*args, **kwargs)
 
 
@@ -144,9 +144,9 @@ class Recipe:
         for name, parameter in inspect.signature(self.builder).parameters.items():
             value = self.bound.arguments[name]
             if parameter.default is inspect.Parameter.empty:
-                parts.append(_shown(value, depth))
-            elif value is not parameter.default and not _same(value, parameter.default):
-                parts.append(f"{name}={_shown(value, depth)}")
+                parts.append(_shown_value(value, depth))
+            elif value is not parameter.default and not _same_content(value, parameter.default):
+                parts.append(f"{name}={_shown_value(value, depth)}")
         inside = ", ".join(parts) if depth or not parts else "..."
         return f"{self.builder.__name__}({inside})"
 
@@ -208,17 +208,17 @@ def content_key(x: Any) -> Hashable:
     if isinstance(x, float | complex):
         return type(x), repr(x)  # tells 0.0 from -0.0, and is the same for every NaN
     if isinstance(x, list | tuple):
-        return _kind(x), *map(content_key, x)
+        return _kind_of(x), *map(content_key, x)
     if isinstance(x, dict):
         return dict, frozenset((content_key(k), content_key(value)) for k, value in x.items())
     if isinstance(x, partial):
         return partial, *map(content_key, (x.func, x.args, x.keywords))
     if isinstance(x, MethodType):
         return MethodType, content_key(x.__func__), content_key(x.__self__)
-    return _reference(x)
+    return _reference_of(x)
 
 
-def _kind(x: Any) -> type:
+def _kind_of(x: Any) -> type:
     return type(x) if hasattr(x, "_fields") else tuple
 
 
@@ -240,7 +240,7 @@ def digest(value: np.ndarray) -> bytes:
     return raw if len(raw) <= LONGEST_RAW else blake2b(raw, digest_size=16).digest()
 
 
-def _reference(x: Any) -> Hashable:
+def _reference_of(x: Any) -> Hashable:
     """A weak reference, which is equal while the things are equal and alive."""
     try:
         hash(x)
@@ -252,14 +252,14 @@ def _reference(x: Any) -> Hashable:
         return x
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same_content(a: Any, b: Any) -> bool:
     try:
         return content_key(a) == content_key(settled(b))
     except NotConcreteError:
         return False
 
 
-def _shown(x: Any, depth: int) -> str:
+def _shown_value(x: Any, depth: int) -> str:
     if not depth:
         return "..."
     if isinstance(x, FromRecipe) and x.recipe is not None:
@@ -267,7 +267,7 @@ def _shown(x: Any, depth: int) -> str:
     if isinstance(x, np.ndarray | jax.Array):
         return f"{x.dtype}{list(x.shape)}"
     if isinstance(x, tuple):
-        return f"({', '.join(_shown(each, depth) for each in x)})" if len(x) < 5 else "(...)"
+        return f"({', '.join(_shown_value(each, depth) for each in x)})" if len(x) < 5 else "(...)"
     if callable(x):
         return getattr(x, "__name__", type(x).__name__)
     return repr(x)

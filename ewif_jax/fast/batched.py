@@ -90,15 +90,15 @@ def contiguous(x: Array) -> Array:
 
 def turned(x: Array) -> Array:
     """The transpose of a matrix, as a pass of its own: fused with its neighbours it is slow."""
-    return stage(_turned, x, batch=0)
+    return stage(_turned_matrix, x, batch=0)
 
 
-def _turned(x: Array) -> Array:
+def _turned_matrix(x: Array) -> Array:
     return contiguous(jnp.swapaxes(x, 0, 1))
 
 
-_ADJOINTS[_turned] = _turned
-_APART.add(_turned)
+_ADJOINTS[_turned_matrix] = _turned_matrix
+_APART.add(_turned_matrix)
 
 
 def turned_rows(x: Array, begin: Array | int, size: int) -> Array:
@@ -109,7 +109,7 @@ def turned_rows(x: Array, begin: Array | int, size: int) -> Array:
 @cache
 def _turned_rows(size: int) -> Function:
     def rows(x: Array, begin: Array) -> Array:
-        return _turned(lax.dynamic_slice_in_dim(x, begin.reshape(()), size))
+        return _turned_matrix(lax.dynamic_slice_in_dim(x, begin.reshape(()), size))
 
     _APART.add(rows)
     return rows
@@ -127,7 +127,7 @@ def smallest(x: Array) -> Array:
     return reduce(jnp.minimum, x)
 
 
-def _flat(fn: Function) -> Callable[..., Sequence[Array]]:
+def _flat_outputs(fn: Function) -> Callable[..., Sequence[Array]]:
     def call(*args: Array) -> Sequence[Array]:
         out = fn(*args)
         return out if isinstance(out, tuple) else (out,)
@@ -136,40 +136,44 @@ def _flat(fn: Function) -> Callable[..., Sequence[Array]]:
 
 
 @cache
-def _jitted(fn: Function) -> Function:
+def _jitted_kernel(fn: Function) -> Function:
     def inside(*args: Array) -> Sequence[Array]:
         with set_xla_metadata(inlineable=None):  # meant for the call only
-            return _flat(fn)(*args)
+            return _flat_outputs(fn)(*args)
 
     return jax.jit(inside)
 
 
 @cache
-def _traced(fn: Function, avals: tuple[tuple[tuple[int, ...], DTypeLike], ...]) -> ClosedJaxpr:
+def _traced_kernel(
+    fn: Function, avals: tuple[tuple[tuple[int, ...], DTypeLike], ...]
+) -> ClosedJaxpr:
     """`fn` traced, once: the same few kernels come again and again in one program."""
-    return jax.make_jaxpr(_flat(fn))(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
+    return jax.make_jaxpr(_flat_outputs(fn))(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
 
 
-def _known(fn: Function, args: Sequence[Array | ShapedArray]) -> ClosedJaxpr:
-    return _traced(fn, tuple((x.shape, x.dtype) for x in args))
+def _kernel_jaxpr(fn: Function, args: Sequence[Array | ShapedArray]) -> ClosedJaxpr:
+    return _traced_kernel(fn, tuple((x.shape, x.dtype) for x in args))
 
 
-def _abstract(*avals: Any, fn: Function, batch: int) -> Sequence[Any]:
-    return [ShapedArray(x.shape, x.dtype) for x in _known(fn, avals).out_avals]
+def _abstract_outputs(*avals: Any, fn: Function, batch: int) -> Sequence[Any]:
+    return [ShapedArray(x.shape, x.dtype) for x in _kernel_jaxpr(fn, avals).out_avals]
 
 
-def _inline(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
-    return jaxpr_as_fun(_known(fn, args))(*args)
+def _inline_kernel(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
+    return jaxpr_as_fun(_kernel_jaxpr(fn, args))(*args)
 
 
-def _apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
+def _kernel_apart(*args: Array, fn: Function, batch: int) -> Sequence[Array]:
     if fn in _CHEAP or (batch == 0 and fn not in _APART):
-        return _inline(*args, fn=fn, batch=batch)
+        return _inline_kernel(*args, fn=fn, batch=batch)
     with set_xla_metadata(inlineable="false"):
-        return _jitted(fn)(*args)
+        return _jitted_kernel(fn)(*args)
 
 
-def _batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, batch: int) -> Any:
+def _batch_kernel(
+    args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, batch: int
+) -> Any:
     runs = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     args = [
         # What all runs share keeps an axis of 1 and is not repeated: a kernel whose inputs are all
@@ -186,17 +190,19 @@ def _batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Function, b
 # The equation that goes into a derivative is again a kernel, so it is batched and kept apart like
 # the first, and derivatives of any order come by the same three rules. Only tangents that move are
 # arguments: a zero tangent would be computed with.
-def _jvp(primals: Sequence[Array], tangents: Sequence[Any], *, fn: Function, batch: int) -> Any:
+def _jvp_kernel(
+    primals: Sequence[Array], tangents: Sequence[Any], *, fn: Function, batch: int
+) -> Any:
     out = _kernel_p.bind(*primals, fn=fn, batch=batch)
     live = tuple(not isinstance(t, ad.Zero) for t in tangents)
     moved = [t for t in tangents if not isinstance(t, ad.Zero)]
     if fn in _ADJOINTS:
         return out, _kernel_p.bind(*moved, fn=fn, batch=batch)
-    return out, _kernel_p.bind(*primals, *moved, fn=_tangent(fn, live), batch=batch)
+    return out, _kernel_p.bind(*primals, *moved, fn=_tangent_kernel(fn, live), batch=batch)
 
 
 @cache
-def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
+def _tangent_kernel(fn: Function, live: tuple[bool, ...]) -> Function:
     """(primals, tangents of the live ones) -> tangents of the outputs."""
 
     def tangent(*args: Array) -> tuple[Array, ...]:
@@ -210,17 +216,19 @@ def _tangent(fn: Function, live: tuple[bool, ...]) -> Function:
         )
 
         def outputs(*at: Array) -> tuple[Array, ...]:
-            return tuple(_inline(*_merge(live, at, primals), fn=fn, batch=0))
+            return tuple(_inline_kernel(*_merge_chosen(live, at, primals), fn=fn, batch=0))
 
         return jax.jvp(outputs, tuple(at), tuple(moved))[1]
 
     return kept_apart(tangent) if fn in _APART else tangent
 
 
-# A kernel is transposed only in arguments in which it is linear (the tangents of `_jvp`). The
+# A kernel is transposed only in arguments in which it is linear (tangents of `_jvp_kernel`). The
 # transpose depends on which these are and on their shapes without runs, so it is a function of
 # both, made once.
-def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) -> Sequence[Any]:
+def _transpose_kernel(
+    cotangents: Sequence[Any], *args: Any, fn: Function, batch: int
+) -> Sequence[Any]:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     unknown = [x.aval for x in args if ad.is_undefined_primal(x)]
     fixed = [x for x in args if not ad.is_undefined_primal(x)]
@@ -229,13 +237,13 @@ def _transpose(cotangents: Sequence[Any], *args: Any, fn: Function, batch: int) 
         return _kernel_p.bind(*given, fn=_ADJOINTS[fn], batch=batch)
     inner = tuple((x.shape[: x.ndim - batch], x.dtype) for x in unknown)
     ranks = tuple(x.ndim - batch for x in (*fixed, *given))
-    out = _kernel_p.bind(*fixed, *given, fn=_adjoint(fn, linear, inner, ranks), batch=batch)
-    results = iter(_summed(x, aval.shape) for x, aval in zip(out, unknown, strict=True))
+    out = _kernel_p.bind(*fixed, *given, fn=_adjoint_kernel(fn, linear, inner, ranks), batch=batch)
+    results = iter(_summed_to(x, aval.shape) for x, aval in zip(out, unknown, strict=True))
     return [next(results) if undefined else None for undefined in linear]
 
 
 @cache
-def _adjoint(
+def _adjoint_kernel(
     fn: Function,
     linear: tuple[bool, ...],
     inner: tuple[tuple[tuple[int, ...], DTypeLike], ...],
@@ -251,11 +259,11 @@ def _adjoint(
         is_fixed = tuple(not x for x in linear)
 
         def outputs(*xs: Array) -> tuple[Array, ...]:
-            every = _merge(is_fixed, fixed, _merge(linear, xs, linear))
-            return tuple(_inline(*every, fn=fn, batch=0))
+            every = _merge_chosen(is_fixed, fixed, _merge_chosen(linear, xs, linear))
+            return tuple(_inline_kernel(*every, fn=fn, batch=0))
 
         # Cotangents of what all runs share arrive with an axis of 1; `linear_transpose` wants the
-        # shape of the output. What is repeated here is summed again in `_summed`.
+        # shape of the output. What is repeated here is summed again in `_summed_to`.
         given = tuple(
             jnp.broadcast_to(x, x.shape[:r] + runs)
             for x, r in zip(given, ranks[count:], strict=True)
@@ -265,13 +273,13 @@ def _adjoint(
     return kept_apart(adjoint) if fn in _APART else adjoint
 
 
-def _merge(chosen: Sequence[bool], some: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+def _merge_chosen(chosen: Sequence[bool], some: Sequence[Any], others: Sequence[Any]) -> list[Any]:
     """`others` with the chosen places taken by `some`, in order."""
     new = iter(some)
     return [next(new) if c else x for c, x in zip(chosen, others, strict=True)]
 
 
-def _summed(x: Array, shape: tuple[int, ...]) -> Array:
+def _summed_to(x: Array, shape: tuple[int, ...]) -> Array:
     """`x` summed over the axes that `shape` has not, or has as 1."""
     axes = tuple(i for i, (a, b) in enumerate(zip(x.shape, shape, strict=True)) if a != b)
     return jnp.sum(x, axes, keepdims=True) if axes else x
@@ -281,10 +289,12 @@ def _summed(x: Array, shape: tuple[int, ...]) -> Array:
 # it. Elsewhere a kernel is a part of the program like any other.
 _kernel_p = Primitive("kernel")
 _kernel_p.multiple_results = True
-_kernel_p.def_impl(lambda *args, fn, batch: _jitted(fn)(*args))
-_kernel_p.def_abstract_eval(_abstract)
-mlir.register_lowering(_kernel_p, mlir.lower_fun(_inline, multiple_results=True))
-mlir.register_lowering(_kernel_p, mlir.lower_fun(_apart, multiple_results=True), platform="cpu")
-batching.primitive_batchers[_kernel_p] = _batch
-ad.primitive_jvps[_kernel_p] = _jvp
-ad.primitive_transposes[_kernel_p] = _transpose
+_kernel_p.def_impl(lambda *args, fn, batch: _jitted_kernel(fn)(*args))
+_kernel_p.def_abstract_eval(_abstract_outputs)
+mlir.register_lowering(_kernel_p, mlir.lower_fun(_inline_kernel, multiple_results=True))
+mlir.register_lowering(
+    _kernel_p, mlir.lower_fun(_kernel_apart, multiple_results=True), platform="cpu"
+)
+batching.primitive_batchers[_kernel_p] = _batch_kernel
+ad.primitive_jvps[_kernel_p] = _jvp_kernel
+ad.primitive_transposes[_kernel_p] = _transpose_kernel

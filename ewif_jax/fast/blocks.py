@@ -78,7 +78,9 @@ def scan_in_blocks(
 
         def put_one(whole: Array, new: Array) -> Array:
             flat = new.reshape(len(new), -1)
-            return _placed(whole, flat, jnp.stack([row, number * flat.shape[1]]), already_there)
+            return _placed_rows(
+                whole, flat, jnp.stack([row, number * flat.shape[1]]), already_there
+            )
 
         return (state, jax.tree.map(put_one, whole, seen)), None
 
@@ -90,7 +92,7 @@ def like(part: Array, same: Array) -> Array:
     """`part` of an array, read from the whole as `same`, which saves a copy of the part; but its
     slopes are those of the part: what is read from a whole adds slopes to all of it."""
     floats = jnp.issubdtype(part.dtype, jnp.floating)
-    return _like(part, lax.stop_gradient(same)) if floats else same
+    return _value_like(part, lax.stop_gradient(same)) if floats else same
 
 
 # Why not plain `same`: the loop over groups reads its part from one whole array. In reverse mode
@@ -101,14 +103,14 @@ def like(part: Array, same: Array) -> Array:
 # value [c, d] and the slope of `part`; `stop_gradient` above leaves nothing for `whole`. Both are
 # the same numbers, so the derivative is exact. (README.md: "Short steps read from the whole".)
 @jax.custom_jvp
-def _like(part: Array, same: Array) -> Array:
+def _value_like(part: Array, same: Array) -> Array:
     del part
     return same
 
 
-@_like.defjvp
+@_value_like.defjvp
 def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return _like(*primals), tangents[0]  # `primals[1]` would end the slopes of the next order
+    return _value_like(*primals), tangents[0]  # `primals[1]` would end the slopes of the next order
 
 
 # Why not the derivative of `dynamic_update_slice`: its transpose hands back the slopes of the whole
@@ -120,13 +122,13 @@ def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 # before has written (`already_there`) are not zeros; their slopes stay with that group.
 # (README.md: "Slopes of a group are added to the whole".)
 @jax.custom_jvp
-def _placed(whole: Array, new: Array, at: Array, already_there: Array | int) -> Array:
+def _placed_rows(whole: Array, new: Array, at: Array, already_there: Array | int) -> Array:
     """`new` in its place in `whole`, which has zeros there, but for the first rows of `new`."""
     del already_there
     return lax.dynamic_update_slice(whole, new, tuple(at))
 
 
-@_placed.defjvp
+@_placed_rows.defjvp
 def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Slopes are added, not put. The transpose of adding leaves the whole as it is; that of putting
     clears it in the place, for which the compiler copies the whole, each time."""
@@ -138,7 +140,7 @@ def _placed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     slope = lax.scatter_add(
         tangents[0], at, jnp.where(fresh, tangents[1], 0), numbers, unique_indices=True
     )
-    return _placed(whole, new, at, already_there), slope
+    return _placed_rows(whole, new, at, already_there), slope
 
 
 def rows(shapes: PyTree) -> Any:

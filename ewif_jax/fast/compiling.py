@@ -58,7 +58,7 @@ def prepare_cpu(devices: int | None = None) -> None:
         RuntimeError: JAX has computed something already.
         ValueError: `devices` is not a whole number >= 1.
     """
-    count = _cores() if devices is None else checks.whole("devices", devices, 1)
+    count = _core_count() if devices is None else checks.whole("devices", devices, 1)
     flags = os.environ.get("XLA_FLAGS", "")
     chosen = _OPTIONS in flags
     # What an application has set itself stays as it is.
@@ -87,7 +87,7 @@ def loops_are_joined() -> bool:
     return _WHOLE_LOOPS in os.environ.get("XLA_FLAGS", "")
 
 
-def _cores() -> int:
+def _core_count() -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return cores or 1
 
@@ -99,12 +99,12 @@ def quick_jit(fn: Callable[..., Any], static_argnames: Any, options: Mapping[str
 
     @cache  # the backend, and so what it knows, is there from the first call on
     def quick() -> Any:
-        understood = {name: options[name] for name in options if name in _known()}
+        understood = {name: options[name] for name in options if name in _known_options()}
         return jax.jit(fn, static_argnames=static_argnames, compiler_options=understood)
 
     @wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (plain if transformed() or not _known() else quick())(*args, **kwargs)
+        return (plain if transformed() or not _known_options() else quick())(*args, **kwargs)
 
     return call
 
@@ -141,7 +141,7 @@ with jax.ensure_compile_time_eval():
 
 
 @cache
-def _known() -> frozenset[str]:
+def _known_options() -> frozenset[str]:
     """The names of the options that this XLA knows: later ones have dropped some."""
     options = {**QUICKEST, **WIDE} if jax.default_backend() == "cpu" else {}
     # XLA refuses unknown options by name and one at a time, and has no list to ask: so a trivial

@@ -25,7 +25,7 @@ def traced(fn: Callable[..., Any], *args: Any) -> Traced:
 
 def dependence(fn: Traced, flags: PyTree) -> Any:
     """Which outputs can depend on the flagged inputs (a pytree of bools; never too few)."""
-    level = _levels(fn, [int(f) for f in jax.tree.leaves(flags)])
+    level = _levels_of(fn, [int(f) for f in jax.tree.leaves(flags)])
     found = [level(v) > 0 for v in fn.closed.jaxpr.outvars]
     return jax.tree.unflatten(jax.tree.structure(fn.outputs), found)
 
@@ -51,7 +51,7 @@ def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
     """
     closed, _ = fn
     jaxpr, numbers = closed.jaxpr, jax.tree.leaves(levels)
-    level = _levels(fn, numbers)
+    level = _levels_of(fn, numbers)
     flagged = jax.tree.leaves(flags)
     late = [v for v, f in zip(jaxpr.outvars, flagged, strict=True) if f]
     early = [v for v, f in zip(jaxpr.outvars, flagged, strict=True) if not f]
@@ -62,7 +62,7 @@ def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
         # Backwards, so that an equation is kept only if something kept after it reads it: dead code
         # goes.
         for eqn in reversed(jaxpr.eqns):
-            if (eqn.effects or read.intersection(eqn.outvars)) and _level(eqn, level) in at:
+            if (eqn.effects or read.intersection(eqn.outvars)) and _level_of(eqn, level) in at:
                 kept.append(eqn)
                 read.update(v for v in eqn.invars if not isinstance(v, Literal))
         return kept[::-1], read
@@ -93,7 +93,7 @@ def divided(fn: Traced, levels: Any, flags: PyTree) -> Divided:
     )
 
 
-def _levels(fn: Traced, inputs: list[int]) -> Callable[[Any], int]:
+def _levels_of(fn: Traced, inputs: list[int]) -> Callable[[Any], int]:
     """Of every variable the highest level of the inputs on which it can depend."""
     jaxpr = fn.closed.jaxpr
     levels = dict(zip(jaxpr.invars, inputs, strict=True))
@@ -102,10 +102,10 @@ def _levels(fn: Traced, inputs: list[int]) -> Callable[[Any], int]:
         return 0 if isinstance(v, Literal) else levels.get(v, 0)
 
     for eqn in jaxpr.eqns:
-        levels.update(dict.fromkeys(eqn.outvars, _level(eqn, level)))
+        levels.update(dict.fromkeys(eqn.outvars, _level_of(eqn, level)))
     return level
 
 
-def _level(eqn: JaxprEqn, level: Callable[[Any], int]) -> int:
+def _level_of(eqn: JaxprEqn, level: Callable[[Any], int]) -> int:
     """Of an equation; what is seen from outside (printing) is left where every run goes."""
     return 2 if eqn.effects else max(map(level, eqn.invars), default=0)

@@ -122,7 +122,7 @@ def group_size(
     sizes = [_odd_lines(-(-runs // groups), itemsize) for groups in range(fewest, 2 * fewest + 2)]
     candidates = [size for size in sizes if min(room, 64) <= size <= min(room, runs)]
     candidates += [runs] * (runs <= room)
-    return min(candidates, key=lambda size: _work(runs, size, itemsize), default=room)
+    return min(candidates, key=lambda size: _work_of(runs, size, itemsize), default=room)
 
 
 def _may_fail(size: int) -> bool:
@@ -144,7 +144,7 @@ def _odd_lines(size: int, itemsize: int) -> int:
     return (lines + 1 - lines % 2) * line
 
 
-def _work(runs: int, size: int, itemsize: int) -> float:
+def _work_of(runs: int, size: int, itemsize: int) -> float:
     """Rows of an odd number of lines come to lie in all sets of a cache, others in each other's
     way: with rows of a power of two a transpose takes ten times as long."""
     lines = size * itemsize / SIZES.line

@@ -92,7 +92,7 @@ def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable
         return fn
     split, shared = PartitionSpec("runs"), PartitionSpec()
     specs = jax.tree.map(lambda f: split if f else shared, flags)
-    mesh = _mesh(devices)
+    mesh = _device_mesh(devices)
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
 
 
@@ -101,7 +101,7 @@ def on_devices(tree: PyTree, flags: PyTree, devices: int) -> Any:
     if devices == 1:
         return tree
 
-    mesh = _mesh(devices)
+    mesh = _device_mesh(devices)
     split, shared = (NamedSharding(mesh, spec) for spec in (PartitionSpec("runs"), PartitionSpec()))
     leaves, structure = jax.tree.flatten(tree)
     places = [split if flag else shared for flag in structure.flatten_up_to(flags)]
@@ -120,7 +120,7 @@ def _on_host(x: Numbers) -> Any:
     return x if others or here.platform != "cpu" else np.asarray(x)
 
 
-def _mesh(devices: int) -> Mesh:
+def _device_mesh(devices: int) -> Mesh:
     return Mesh(np.asarray(jax.local_devices()[:devices]), ("runs",))
 
 

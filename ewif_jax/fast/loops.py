@@ -87,9 +87,9 @@ def over_runs(
     single = jax.eval_shape(lambda inputs: one_run(inputs, per_run), inputs)
     run = _traced_run(loop, single, per_run)
     levels = (
-        _levels(per_run.params, 0),
-        _levels(run.state_differs, 1),
-        _levels(per_run.arrivals, 1),
+        _input_levels(per_run.params, 0),
+        _input_levels(run.state_differs, 1),
+        _input_levels(per_run.arrivals, 1),
     )
     parts = divided(run.step, levels, run.differ)
     runs, _, m = inputs.measurements.value.shape
@@ -104,7 +104,7 @@ def over_runs(
 
 def _traced_run(loop: Loop, single: Inputs, per_run: Inputs) -> OneRun:
     start = traced(loop.start, *single.first)
-    arrival = jax.eval_shape(_first, single.arrivals)
+    arrival = jax.eval_shape(_first_arrival, single.arrivals)
     step = traced(loop.step, single.params, start.outputs, arrival)
     state_differs = dependence(start, per_run.first)
     differ = _that_differ(step, per_run.params, state_differs, per_run.arrivals)
@@ -114,12 +114,14 @@ def _traced_run(loop: Loop, single: Inputs, per_run: Inputs) -> OneRun:
 def _portion_of(run: OneRun, shown: PyTree, per_run: Inputs, value: Array, ahead: bool) -> Portion:
     """How many runs and steps at a time, for an estimate of such a size."""
     runs, steps, _ = value.shape
-    own, shared, largest = _sizes(run.start.outputs, run.state_differs, shown)
+    own, shared, largest = _byte_sizes(run.start.outputs, run.state_differs, shown)
     # Whether a filter draws is read off its equations: only the key is taken as different by run,
     # and what then differs in the first state holds random members.
     of_key = dependence(
         run.start,
-        per_run._replace(params=_alike(per_run.params), prior=_alike(per_run.prior)).first,
+        per_run._replace(
+            params=_all_shared(per_run.params), prior=_all_shared(per_run.prior)
+        ).first,
     )
     draws = any(jax.tree.leaves(of_key))
     together = goes_together(run.step)
@@ -144,15 +146,15 @@ def _that_differ(
         state_f = either
 
 
-def _levels(flags: PyTree, shared: int) -> Any:
+def _input_levels(flags: PyTree, shared: int) -> Any:
     return jax.tree.map(lambda f: 2 if f else shared, flags)
 
 
-def _first(arrivals: PyTree) -> Any:
+def _first_arrival(arrivals: PyTree) -> Any:
     return jax.tree.map(lambda x: x[0], arrivals)
 
 
-def _sizes(state: State, state_f: PyTree, shown: PyTree) -> tuple[int, int, int]:
+def _byte_sizes(state: State, state_f: PyTree, shown: PyTree) -> tuple[int, int, int]:
     """The bytes of a run's own state, of the state that all share, and of the largest array in one
     or in an estimate."""
     sizes, estimated = (
@@ -213,20 +215,20 @@ def _shared_ahead(
 def _in_groups(
     loop: Loop, inputs: Inputs, per_run: Inputs, differ: Sequence[PyTree], portion: Portion
 ) -> tuple[Any, Any]:
-    alone = _alike((per_run, differ))
+    alone = _all_shared((per_run, differ))
 
     def group(inputs: Inputs, place: Place | None) -> tuple[Any, Any]:
         flags, differ_inside = (per_run, differ) if portion.runs > 1 else alone
-        return _scanned(loop, inputs, flags, differ_inside, portion, place)
+        return _scanned_group(loop, inputs, flags, differ_inside, portion, place)
 
     return in_groups(group, inputs, per_run, inputs.measurements.value.shape[0], portion)
 
 
-def _alike(flags: PyTree) -> Any:
+def _all_shared(flags: PyTree) -> Any:
     return jax.tree.map(lambda _: False, flags)
 
 
-def _scanned(
+def _scanned_group(
     loop: Loop,
     inputs: Inputs,
     per_run: Inputs,

@@ -50,12 +50,12 @@ def with_few_slopes(fn: Callable[..., Any], per_run: PyTree) -> Callable[..., An
             return jax.tree.unflatten(results, jaxpr_as_fun(own)(*xs[:count]))
 
         each = [*marks, *(False for _ in closed.consts)]
-        return _sloped(of_all, each)(*leaves, *closed.consts)
+        return _with_slopes(of_all, each)(*leaves, *closed.consts)
 
     return call
 
 
-def _sloped(fn: Callable[..., Any], per_run: Sequence[bool]) -> Callable[..., Any]:
+def _with_slopes(fn: Callable[..., Any], per_run: Sequence[bool]) -> Callable[..., Any]:
     @jax.custom_jvp
     def call(*xs: Array) -> Any:
         return fn(*xs)
@@ -113,11 +113,11 @@ def _in_columns(
         # both, and the mixed derivative, which nobody reads, is dropped by the compiler
         # (docs/decisions/fast.md).
         (out, one), (other, _) = jax.jvp(lambda x: jax.jvp(fn, (x,), (first,)), (start,), (second,))
-        return out, jax.tree.map(lambda *both: _stacked(both), one, other)
+        return out, jax.tree.map(lambda *both: _stacked_slopes(both), one, other)
 
     if count == 1:
         out, slope = jax.jvp(fn, (start,), (direction(jnp.ones(1)),))
-        columns = jax.tree.map(lambda x: _stacked([x]), slope)
+        columns = jax.tree.map(lambda x: _stacked_slopes([x]), slope)
     elif count == 2:
         out, columns = pair(jnp.eye(2))
     else:
@@ -135,14 +135,14 @@ def _in_columns(
     # loop above is never run backwards. In a batch a parameter of each run moves only its own run,
     # so that one column serves all runs (the Jacobian is block diagonal).
     taken = [step for x in steps for step in x]
-    return out, jax.tree.map(lambda x, column: _along(x, column, taken), out, columns)
+    return out, jax.tree.map(lambda x, column: _along_columns(x, column, taken), out, columns)
 
 
-def _stacked(parts: Sequence[Array]) -> Any:
+def _stacked_slopes(parts: Sequence[Array]) -> Any:
     return parts[0] if parts[0].dtype == float0 else jnp.stack(parts)
 
 
-def _along(value: Array, columns: Array, steps: Sequence[Array]) -> Any:
+def _along_columns(value: Array, columns: Array, steps: Sequence[Array]) -> Any:
     """How far a value moves if every number takes its step, () or (R,)."""
     if not jnp.issubdtype(value.dtype, jnp.floating):
         return np.zeros(value.shape, float0)

@@ -23,21 +23,21 @@ from ewif_jax.fast.sparse import Pattern, multiplied, product
 def matmul(a: Array, b: Array, where: Pattern | None = None) -> Array:
     """`a @ b` for two matrices, of which a may differ from zero `where`; under `vmap` the result is
     batched along its last axis."""
-    return _matmul_p.bind(a, b) if where is None else _sparse(where)(a, b)
+    return _matmul_p.bind(a, b) if where is None else _sparse_product(where)(a, b)
 
 
 def matvec(a: Array, x: Array, where: Pattern | None = None) -> Array:
     """`a @ x` for a matrix, which may differ from zero `where`, and a vector, with the batching of
     `matmul`."""
-    return matmul(a, x[:, None])[:, 0] if where is None else _sparse(where)(a, x)
+    return matmul(a, x[:, None])[:, 0] if where is None else _sparse_product(where)(a, x)
 
 
 @cache
-def _sparse(where: Pattern) -> Callable[[Array, Array], Array]:
+def _sparse_product(where: Pattern) -> Callable[[Array, Array], Array]:
     return kernel(lambda a, x: product(a, x, where), cheap=True)
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot_product(a: Array, b: Array) -> Array:
     # Up to here one fused loop is faster than a call of a library (3 microseconds). Found by
     # measuring (`README.md`: "A single matrix is computed whole").
     if a.size * b.shape[1] <= (256 if b.shape[1] > 16 else 4096):
@@ -46,11 +46,11 @@ def _dot(a: Array, b: Array) -> Array:
     return lax.dot(contiguous(a), b, precision=lax.Precision.HIGHEST)
 
 
-def _abstract(a, b):
+def _product_shape(a, b):
     return ShapedArray((a.shape[0], b.shape[1]), jnp.promote_types(a.dtype, b.dtype))
 
 
-def _batch(args, dims):
+def _batch_product(args, dims):
     a, b = args
     da, db = dims
     if da is None:  # (i,k) . (k,j*R): one product, batch last
@@ -71,12 +71,12 @@ def _sum_of_products(a: Array, b: Array) -> Array:
 
 
 _matmul_p = Primitive("small_matmul")
-_matmul_p.def_impl(jax.jit(_dot))
-_matmul_p.def_abstract_eval(_abstract)
-mlir.register_lowering(_matmul_p, mlir.lower_fun(_dot, multiple_results=False))
+_matmul_p.def_impl(jax.jit(_dot_product))
+_matmul_p.def_abstract_eval(_product_shape)
+mlir.register_lowering(_matmul_p, mlir.lower_fun(_dot_product, multiple_results=False))
 ad.defbilinear(
     _matmul_p,
     lambda ct, a, b: matmul(ct, b.T),
     lambda ct, a, b: matmul(a.T, ct),
 )
-batching.primitive_batchers[_matmul_p] = _batch
+batching.primitive_batchers[_matmul_p] = _batch_product

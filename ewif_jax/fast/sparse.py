@@ -73,10 +73,10 @@ def product(a: Array, x: Array, where: Pattern) -> Array:
     if a.ndim == 2:
         return multiplied(a, x)
     between = (slice(None), *(None,) * (x.ndim - a.ndim + 1))
-    return total(factor[between] * _rows(x, column) for factor, column in by_row(a, where))
+    return total(factor[between] * _picked_rows(x, column) for factor, column in by_row(a, where))
 
 
-def _rows(x: Array, which: np.ndarray) -> Array:
+def _picked_rows(x: Array, which: np.ndarray) -> Array:
     """x[which], which is x itself where that is all rows in their order."""
     return x if np.array_equal(which, np.arange(x.shape[0])) else x[which]
 

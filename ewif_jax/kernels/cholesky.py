@@ -32,7 +32,7 @@ def factor(a: Array, tolerance: float | None = None, size: Array | None = None) 
     if tolerance is None:
         tolerance = negligible(a.shape[0], a.dtype)
     sizes = () if size is None else (size,)
-    lower, reciprocal = _factor(tolerance)(a, *sizes)
+    lower, reciprocal = _factor_kernel(tolerance)(a, *sizes)
     return Factor(lower, reciprocal, jnp.all(reciprocal > 0))
 
 
@@ -58,7 +58,7 @@ def solve(f: Factor, b: Array) -> Array:
 
 def solved(a: Array, b: Array) -> Array:
     """A^-1 b for b (n,) or (n, k), where the factor itself is not needed."""
-    return _solved(negligible(a.shape[0], a.dtype))(a, b)
+    return _solved_kernel(negligible(a.shape[0], a.dtype))(a, b)
 
 
 def inverse(f: Factor) -> Array:
@@ -75,32 +75,34 @@ def half_log_det(f: Factor) -> Array:
 
 
 @cache
-def _factor(tolerance: float) -> Callable[..., tuple[Array, Array]]:
-    return kernel(lambda a, *size: _factored(a, tolerance, *size))
+def _factor_kernel(tolerance: float) -> Callable[..., tuple[Array, Array]]:
+    return kernel(lambda a, *size: _factored_columns(a, tolerance, *size))
 
 
 @cache
-def _solved(tolerance: float) -> Callable[[Array, Array], Array]:
-    return kernel(lambda a, b: _solve_rows(*_factored(a, tolerance), b))
+def _solved_kernel(tolerance: float) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, b: _solve_rows(*_factored_columns(a, tolerance), b))
 
 
-def _factored(a: Array, tolerance: float, size: Array | None = None) -> tuple[Array, Array]:
+def _factored_columns(a: Array, tolerance: float, size: Array | None = None) -> tuple[Array, Array]:
     n, batch = a.shape[0], a.ndim - 2
     columns, reciprocals, rest = [], [], a
     for j in range(n):
-        column, reciprocal = _apart(
-            n, _column(tolerance), rest, a[j, j] if size is None else size[j], batch=batch
+        column, reciprocal = _step_apart(
+            n, _column_step(tolerance), rest, a[j, j] if size is None else size[j], batch=batch
         )
         columns.append(lax.pad(column, jnp.zeros((), a.dtype), [(j, 0, 0), *[(0, 0, 0)] * batch]))
         reciprocals.append(reciprocal)
         if j < n - 1:
             below = column[1:]
-            rest = _apart(n, _less, rest[1:, 1:], below[:, None], below[None], batch=batch)
+            rest = _step_apart(
+                n, _product_less, rest[1:, 1:], below[:, None], below[None], batch=batch
+            )
     return jnp.stack(columns, 1), jnp.stack(reciprocals)
 
 
 @cache
-def _column(tolerance: float) -> Callable[..., tuple[Array, Array]]:
+def _column_step(tolerance: float) -> Callable[..., tuple[Array, Array]]:
     """(what is left of a, the diagonal element as it was) -> the first column of the factor, and
     the reciprocal of its pivot."""
 
@@ -120,19 +122,28 @@ def _column(tolerance: float) -> Callable[..., tuple[Array, Array]]:
 def _forward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
     n, x = len(b), []
     for j in range(n):
-        x.append(_scaled(b[0], reciprocal[j]))
+        x.append(_scaled_by(b[0], reciprocal[j]))
         if j < n - 1:
             factors = lower[j + 1 :, j]
-            b = _apart(n, _less, b[1:], _wide(factors, b), x[-1][None], batch=lower.ndim - 2)
+            b = _step_apart(
+                n, _product_less, b[1:], _wide_as(factors, b), x[-1][None], batch=lower.ndim - 2
+            )
     return stacked(x)
 
 
 def _backward_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
     n, x = len(b), []
     for j in reversed(range(n)):
-        x.insert(0, _scaled(b[-1], reciprocal[j]))
+        x.insert(0, _scaled_by(b[-1], reciprocal[j]))
         if j > 0:
-            b = _apart(n, _less, b[:-1], _wide(lower[j, :j], b), x[0][None], batch=lower.ndim - 2)
+            b = _step_apart(
+                n,
+                _product_less,
+                b[:-1],
+                _wide_as(lower[j, :j], b),
+                x[0][None],
+                batch=lower.ndim - 2,
+            )
     return stacked(x)
 
 
@@ -143,21 +154,21 @@ def _solve_rows(lower: Array, reciprocal: Array, b: Array) -> Array:
 _forward, _backward, _solve = map(kernel, (_forward_rows, _backward_rows, _solve_rows))
 
 
-def _apart(n: int, fn: Callable[..., Any], *args: Array, batch: int) -> Any:
+def _step_apart(n: int, fn: Callable[..., Any], *args: Array, batch: int) -> Any:
     """`fn`, computed once where recomputing for an (n, n) matrix would add up."""
     # Unrolled and fused, a step would be computed again for each later one that reads it. Up to 3
     # rows that costs less than the calls.
     return stage(fn, *args, batch=batch) if n > 3 else fn(*args)
 
 
-def _less(x: Array, a: Array, b: Array) -> Array:
+def _product_less(x: Array, a: Array, b: Array) -> Array:
     return x - a * b
 
 
-def _scaled(x: Array, number: Array) -> Array:
+def _scaled_by(x: Array, number: Array) -> Array:
     return x * (number if x.ndim == number.ndim else number[None])
 
 
-def _wide(x: Array, like: Array) -> Array:
+def _wide_as(x: Array, like: Array) -> Array:
     """`x` with the axis that right-hand sides have, if there is one in `like`."""
     return x[:, None] if like.ndim > x.ndim else x

@@ -81,17 +81,17 @@ def update(
     """
     H, R = jnp.where(mask[:, None], H, 0), mask_cov(R, mask)
     cross = symmetric.rows(H, packed, H_where)
-    cov = _expected(H_where)(cross, H, R)
+    cov = _expected_cov(H_where)(cross, H, R)
     factor = cholesky.factor(cov, size=sizes(packed, H, R, H_where))
     innovation = Innovation(jnp.where(mask, difference, 0), cov, factor, cross)
     weights = cholesky.solve(innovation.factor, cross)
-    mean = _moved(mean, weights, innovation.value)
+    mean = _moved_mean(mean, weights, innovation.value)
     # P - P H' K' first, then + K (R K' - H half): the same as Joseph's product, but two low-rank
     # steps on the triangle in place of two n x n products.
-    half = _less(packed, cross, weights)
+    half = _packed_less(packed, cross, weights)
     left_over = _left_over(R, weights, symmetric.rows(H, half, H_where))
-    least = _least(mean.shape[0])(R, cov)
-    return mean, _more(packed, half, weights, left_over, least), innovation
+    least = _least_share(mean.shape[0])(R, cov)
+    return mean, _packed_more(packed, half, weights, left_over, least), innovation
 
 
 def rounding_of(predicted: Array) -> Array:
@@ -104,19 +104,19 @@ def sizes(packed: Array, H: Array, R: Array, H_where: Pattern | None = None) -> 
     cancel in H P H' + R. None where there is one term only. H and R are masked."""
     if H_where is not None and max(map(sum, H_where)) <= 1:
         return None
-    return _terms(packed, H, R)
+    return _term_sizes(packed, H, R)
 
 
 @kernel
-def _terms(packed: Array, H: Array, R: Array) -> Array:
+def _term_sizes(packed: Array, H: Array, R: Array) -> Array:
     m, n = H.shape[:2]
-    variances = packed[_diagonal(n)]
+    variances = packed[_diagonal_places(n)]
     noise = jnp.stack([R[k, k] for k in range(m)])
     return noise + n * total(jnp.square(H[:, i]) * variances[i][None] for i in range(n))
 
 
 @cache
-def _expected(where: Pattern | None) -> Callable[[Array, Array, Array], Array]:
+def _expected_cov(where: Pattern | None) -> Callable[[Array, Array, Array], Array]:
     @kernel
     def expected(cross: Array, H: Array, R: Array) -> Array:
         """H P H' + R, from H P."""
@@ -142,53 +142,59 @@ def update_from_afar(
     `spread` (m, m) its own without noise, `size` as in `innovate`."""
     innovation = innovate(difference, cross, spread + R, mask, size)
     weights = cholesky.solve(innovation.factor, innovation.cross)
-    mean = _moved(mean, weights, innovation.value)
-    half = _less(packed, innovation.cross, weights)
+    mean = _moved_mean(mean, weights, innovation.value)
+    half = _packed_less(packed, innovation.cross, weights)
     seen = innovation.cross - matmul(jnp.where(mask[:, None] & mask[None, :], spread, 0), weights)
     R = mask_cov(R, mask)
-    least = _least(mean.shape[0])(R, innovation.cov)
-    return mean, _more(packed, half, weights, _left_over(R, weights, seen), least), innovation
+    least = _least_share(mean.shape[0])(R, innovation.cov)
+    return (
+        mean,
+        _packed_more(packed, half, weights, _left_over(R, weights, seen), least),
+        innovation,
+    )
 
 
 @kernel
-def _moved(mean: Array, weights: Array, value: Array) -> Array:
+def _moved_mean(mean: Array, weights: Array, value: Array) -> Array:
     """mean + K value, with K' = weights."""
-    return mean + _contract(weights, value[:, None])
+    return mean + _contract_first(weights, value[:, None])
 
 
 @kernel
-def _less(packed: Array, cross: Array, weights: Array) -> Array:
+def _packed_less(packed: Array, cross: Array, weights: Array) -> Array:
     """P - P H' K', packed."""
     rows, cols = np.triu_indices(cross.shape[1])
-    return packed - _contract(cross[:, rows], weights[:, cols])
+    return packed - _contract_first(cross[:, rows], weights[:, cols])
 
 
 @kernel
 def _left_over(R: Array, weights: Array, seen: Array) -> Array:
     """R K' - H half; `seen` = H half."""
-    return _contract(R[:, :, None], weights[:, None, :]) - seen
+    return _contract_first(R[:, :, None], weights[:, None, :]) - seen
 
 
 @kernel
-def _more(packed: Array, half: Array, weights: Array, left_over: Array, least: Array) -> Array:
+def _packed_more(
+    packed: Array, half: Array, weights: Array, left_over: Array, least: Array
+) -> Array:
     """half + K left_over, packed, no variance below 0, and none of what is less than `least` () of
     what it was, which is rounding. Its derivatives stay."""
     rows, cols = np.triu_indices(weights.shape[1])
-    cov = half + _contract(weights[:, rows], left_over[:, cols])
+    cov = half + _contract_first(weights[:, rows], left_over[:, cols])
     rounding = jnp.where(jnp.abs(cov) < least[None] * jnp.abs(packed), cov, 0)
     return symmetric.no_negative(cov - lax.stop_gradient(rounding))
 
 
 def cleared(packed: Array, before: Array, R: Array, innovation_cov: Array) -> Array:
     """A packed covariance after a measurement without what is only rounding of the one before."""
-    least = _least(symmetric.order(packed))(R, innovation_cov)
+    least = _least_share(symmetric.order(packed))(R, innovation_cov)
     return packed - lax.stop_gradient(
         jnp.where(jnp.abs(packed) < least * jnp.abs(before), packed, 0)
     )
 
 
 @cache
-def _least(n: int) -> Callable[[Array, Array], Array]:
+def _least_share(n: int) -> Callable[[Array, Array], Array]:
     """Which share of a covariance (n, n) is rounding after a measurement of noise R and innovation
     covariance `cov`: Joseph's form leaves the square of what the covariance was rounded by. Where
     nothing but exact components is seen, even its rounding is larger than all that is right."""
@@ -209,10 +215,10 @@ def _least(n: int) -> Callable[[Array, Array], Array]:
     return least
 
 
-def _diagonal(n: int) -> np.ndarray:
+def _diagonal_places(n: int) -> np.ndarray:
     return np.diagonal(symmetric.places(n))
 
 
-def _contract(a: Array, b: Array) -> Array:
+def _contract_first(a: Array, b: Array) -> Array:
     """The sum of a b over their first axis."""
     return total(a[k] * b[k] for k in range(a.shape[0]))

@@ -16,21 +16,21 @@ def spread(vectors: Array, variances: Array, certain: bool = False) -> tuple[Arr
     No variance is below the rounding of its component, (8 n eps)^2 of it: what the motion makes as
     good as certain stays regular; or, with `certain`, becomes so.
     """
-    unit, kept = (_spread_certain if certain else _spread)(vectors, variances)
+    unit, kept = (_spread_certain if certain else _spread_kernel)(vectors, variances)
     return kept, strict(inverse(strict(unit)))
 
 
 @kernel
-def _spread(vectors: Array, variances: Array) -> tuple[Array, Array]:
-    return _orthogonal(vectors, variances, _projected)
+def _spread_kernel(vectors: Array, variances: Array) -> tuple[Array, Array]:
+    return _orthogonal_vectors(vectors, variances, _projected_out)
 
 
 @kernel
 def _spread_certain(vectors: Array, variances: Array) -> tuple[Array, Array]:
-    return _orthogonal(vectors, variances, _projected_certain)
+    return _orthogonal_vectors(vectors, variances, _projected_certain)
 
 
-def _orthogonal(vectors: Array, variances: Array, project: Callable[..., Any]) -> Any:
+def _orthogonal_vectors(vectors: Array, variances: Array, project: Callable[..., Any]) -> Any:
     n, batch = vectors.shape[0], variances.ndim - 1
     floors = least_share(n, vectors.dtype) * jnp.sum(vectors * vectors * variances[None], 1)
     # From the last component to the first, because the equations are unit upper triangular: row k
@@ -44,19 +44,19 @@ def _orthogonal(vectors: Array, variances: Array, project: Callable[..., Any]) -
     return jnp.stack(columns, 1), stacked(kept)
 
 
-def _projected(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
+def _projected_out(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
     """Takes the last vector out of the others."""
     weighted = rest[-1] * variances
-    return _without(rest, weighted, jnp.maximum(jnp.sum(rest[-1] * weighted, 0), floor))
+    return _without_last(rest, weighted, jnp.maximum(jnp.sum(rest[-1] * weighted, 0), floor))
 
 
 def _projected_certain(rest: Array, variances: Array, floor: Array) -> tuple[Array, Array, Array]:
     weighted = rest[-1] * variances
     variance = jnp.sum(rest[-1] * weighted, 0)
-    return _without(rest, weighted, jnp.where(variance > floor, variance, 0))
+    return _without_last(rest, weighted, jnp.where(variance > floor, variance, 0))
 
 
-def _without(rest: Array, weighted: Array, variance: Array) -> tuple[Array, Array, Array]:
+def _without_last(rest: Array, weighted: Array, variance: Array) -> tuple[Array, Array, Array]:
     some = variance > 0
     reciprocal = jnp.where(some, 1 / jnp.where(some, variance, 1), 0)
     column = jnp.sum(rest[:-1] * weighted[None], 1) * reciprocal[None]

@@ -31,24 +31,24 @@ def places(n: int) -> np.ndarray:
     return where
 
 
-def _pick(full: Array) -> Array:
+def _pick_upper(full: Array) -> Array:
     n = full.shape[0]
     rows, cols = np.triu_indices(n)
     return full.reshape(n * n, *full.shape[2:])[rows * n + cols]
 
 
-def _fill(packed: Array) -> Array:
+def _fill_upper(packed: Array) -> Array:
     n = order(packed)
     upper = jnp.asarray(np.triu(np.ones((n, n))), packed.dtype)
-    return _spread(packed) * upper.reshape(n, n, *(1,) * (packed.ndim - 1))
+    return _spread_full(packed) * upper.reshape(n, n, *(1,) * (packed.ndim - 1))
 
 
-def _spread(packed: Array) -> Array:
+def _spread_full(packed: Array) -> Array:
     n = order(packed)
     return packed[places(n).ravel()].reshape(n, n, *packed.shape[1:])
 
 
-def _gather(full: Array) -> Array:
+def _gather_upper(full: Array) -> Array:
     n = full.shape[0]
     rows, cols = np.triu_indices(n)
     flat = full.reshape(n * n, *full.shape[2:])
@@ -58,8 +58,8 @@ def _gather(full: Array) -> Array:
     return flat[rows * n + cols] + twice * flat[cols * n + rows]
 
 
-_pack = linear_kernel(_pick, _fill, cheap=True)
-_unpack = linear_kernel(_spread, _gather)
+_pack = linear_kernel(_pick_upper, _fill_upper, cheap=True)
+_unpack = linear_kernel(_spread_full, _gather_upper)
 
 
 def pack(full: Array) -> Array:
@@ -77,14 +77,14 @@ def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
 
     A dense matrix a that the batch shares is one product with its second power.
     """
-    return _congruence(where)(a, packed)
+    return _congruence_kernel(where)(a, packed)
 
 
 def propagated(
     a: Array, packed: Array, plus: Array, is_defined: Array, where: Pattern | None = None
 ) -> Array:
     """a P a' + plus, packed, NaN unless `is_defined` ()."""
-    return _propagated(where)(a, packed, plus, is_defined)
+    return _propagated_kernel(where)(a, packed, plus, is_defined)
 
 
 def no_negative(packed: Array) -> Array:
@@ -94,7 +94,7 @@ def no_negative(packed: Array) -> Array:
 
 def rows(a: Array, packed: Array, where: Pattern | None = None) -> Array:
     """a P (m, n) for a matrix a (m, n) and a packed P; `where` a may differ from zero."""
-    return _rows(where)(a, packed)
+    return _rows_kernel(where)(a, packed)
 
 
 def times(packed: Array, x: Array) -> Array:
@@ -115,7 +115,7 @@ def regress(packed: Array, cross: Array) -> tuple[Array, Array]:
     A pivot that is zero to rounding (below 8 n eps times its diagonal element) is left out, with
     derivative 0.
     """
-    return _regress(packed, cross)
+    return _regress_kernel(packed, cross)
 
 
 def inverse(packed: Array) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ def inverse(packed: Array) -> tuple[Array, Array]:
     A pivot that is zero to rounding (below 8 n eps times its diagonal element) ends the rank. The
     derivative is that of the exact inverse, -P^-1 dP P^-1.
     """
-    result = _inverse(packed)
+    result = _inverse_swept(packed)
     # A pivot that was left out leaves a zero on the diagonal of the result. The outer `where` then
     # gives the identity and cuts the derivative off.
     full_rank = smallest(diagonal(result)) > 0
@@ -133,26 +133,26 @@ def inverse(packed: Array) -> tuple[Array, Array]:
 
 
 @kernel
-def _regress(packed: Array, cross: Array) -> tuple[Array, Array]:
+def _regress_kernel(packed: Array, cross: Array) -> tuple[Array, Array]:
     """Elimination row by row of [[P, B'], [B, 0]], and back for the rows of the weights."""
     (m, n), batch = cross.shape[:2], packed.ndim - 1
-    least = _least(packed)
+    least = _least_pivot(packed)
     # Block elimination of P leaves 0 - B P^-1 B' in the corner: what is explained falls out with
     # its sign changed, symmetric, and without forming P^-1. The weights B P^-1 follow by going back
     # through the eliminated rows, as in solving (docs/decisions/estimators.md: "One elimination for
     # late measurements").
-    rest, eliminated = stage(_bordered, packed, cross, batch=batch), []
+    rest, eliminated = stage(_bordered_matrix, packed, cross, batch=batch), []
     for k in range(n):
-        reciprocal = stage(_reciprocal, rest[0], least[k], batch=batch)
+        reciprocal = stage(_pivot_reciprocal, rest[0], least[k], batch=batch)
         eliminated.append((rest[: n - k + m], reciprocal))
-        rest = stage(_eliminated, rest, reciprocal, batch=batch)
+        rest = stage(_eliminated_first, rest, reciprocal, batch=batch)
     weights: list[Array] = []
     for row, reciprocal in reversed(eliminated):
-        weights.insert(0, stage(_weights, row, reciprocal, *weights, batch=batch))
+        weights.insert(0, stage(_row_weights, row, reciprocal, *weights, batch=batch))
     return jnp.stack(weights, 1), -rest[places(m)]
 
 
-def _bordered(packed: Array, cross: Array) -> Array:
+def _bordered_matrix(packed: Array, cross: Array) -> Array:
     """[[P, B'], [B, 0]], packed."""
     m, n = cross.shape[:2]
     runs = jnp.broadcast_shapes(packed.shape[1:], cross.shape[2:])
@@ -164,13 +164,13 @@ def _bordered(packed: Array, cross: Array) -> Array:
     return numbers[index[np.triu_indices(n + m)]]
 
 
-def _reciprocal(pivot: Array, least: Array) -> Array:
+def _pivot_reciprocal(pivot: Array, least: Array) -> Array:
     """1 / pivot, or 0 where there is none."""
     kept = pivot > least
     return jnp.where(kept, 1 / jnp.where(kept, pivot, 1), 0)
 
 
-def _eliminated(rest: Array, reciprocal: Array) -> Array:
+def _eliminated_first(rest: Array, reciprocal: Array) -> Array:
     """The packed matrix without its first unknown."""
     n = order(rest)
     rows, cols = np.triu_indices(n - 1)
@@ -178,7 +178,7 @@ def _eliminated(rest: Array, reciprocal: Array) -> Array:
     return rest[n:] - reciprocal[None] * first[rows] * first[cols]
 
 
-def _weights(row: Array, reciprocal: Array, *later: Array) -> Array:
+def _row_weights(row: Array, reciprocal: Array, *later: Array) -> Array:
     """The weights (m,) of an unknown: from its row when it was eliminated, and later weights."""
     end = 1 + len(later)
     remainder = row[end:]
@@ -187,40 +187,40 @@ def _weights(row: Array, reciprocal: Array, *later: Array) -> Array:
     return remainder * reciprocal[None]
 
 
-def _least(packed: Array) -> Array:
+def _least_pivot(packed: Array) -> Array:
     """Below this a pivot counts as zero."""
     return 8 * order(packed) * float(jnp.finfo(packed.dtype).eps) * diagonal(packed)
 
 
 @jax.custom_jvp
-def _inverse(packed: Array) -> Array:
-    return _swept(packed)
+def _inverse_swept(packed: Array) -> Array:
+    return _swept_all(packed)
 
 
-@_inverse.defjvp
+@_inverse_swept.defjvp
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    result = _inverse(*primals)
+    result = _inverse_swept(*primals)
     return result, -congruence(unpack(result), *tangents)
 
 
 @kernel
-def _swept(packed: Array) -> Array:
+def _swept_all(packed: Array) -> Array:
     """Gauss-Jordan elimination without exchanges; zero rows where there is no pivot."""
-    n, batch, least = order(packed), packed.ndim - 1, _least(packed)
+    n, batch, least = order(packed), packed.ndim - 1, _least_pivot(packed)
     for k in range(n):
-        packed = stage(_sweep(n, k), packed, least[k], batch=batch)
+        packed = stage(_sweep_step(n, k), packed, least[k], batch=batch)
     return -packed
 
 
 @cache
-def _sweep(n: int, k: int) -> Callable[[Array, Array], Array]:
+def _sweep_step(n: int, k: int) -> Callable[[Array, Array], Array]:
     rows, cols = np.triu_indices(n)
 
     def swept(packed: Array, least: Array) -> Array:
         """Exchanges the roles of unknown and right-hand side number k."""
         shape = (-1, *(1,) * (packed.ndim - 1))
         pivot = packed[places(n)[k, k]]
-        reciprocal = _reciprocal(pivot, least)
+        reciprocal = _pivot_reciprocal(pivot, least)
         left = jnp.where((rows == k).reshape(shape), -1, packed[places(n)[k, rows]])
         right = jnp.where((cols == k).reshape(shape), -1, packed[places(n)[k, cols]])
         # One formula for the whole triangle: with -1 in place of the pivot's own row and column,
@@ -240,56 +240,56 @@ def _no_negative(packed: Array) -> Array:
 
 
 @cache
-def _rows(where: Pattern | None) -> Callable[[Array, Array], Array]:
-    return kernel(lambda a, packed: _left(a, packed, where))
+def _rows_kernel(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, packed: _left_product(a, packed, where))
 
 
 @cache
-def _congruence(where: Pattern | None) -> Callable[[Array, Array], Array]:
-    return kernel(lambda a, packed: _moved(a, packed, where))
+def _congruence_kernel(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return kernel(lambda a, packed: _moved_packed(a, packed, where))
 
 
 @cache
-def _propagated(where: Pattern | None) -> Callable[..., Array]:
+def _propagated_kernel(where: Pattern | None) -> Callable[..., Array]:
     @kernel
     def moved(a: Array, packed: Array, plus: Array, is_defined: Array) -> Array:
-        return jnp.where(is_defined[None], _moved(a, packed, where) + plus, jnp.nan)
+        return jnp.where(is_defined[None], _moved_packed(a, packed, where) + plus, jnp.nan)
 
     return moved
 
 
 @cache
-def _half(where: Pattern | None) -> Callable[[Array, Array], Array]:
-    return lambda a, packed: _left(a, packed, where)
+def _half_product(where: Pattern | None) -> Callable[[Array, Array], Array]:
+    return lambda a, packed: _left_product(a, packed, where)
 
 
-def _left(a: Array, packed: Array, where: Pattern | None) -> Array:
+def _left_product(a: Array, packed: Array, where: Pattern | None) -> Array:
     """a P (m, n)."""
     if packed.ndim == 1:
-        return multiplied(a, _spread(packed))
+        return multiplied(a, _spread_full(packed))
     at = places(a.shape[1])
     return total(f[:, None] * packed[at[k]] for f, k in by_row(a, where or full(*a.shape[:2])))
 
 
-def _moved(a: Array, packed: Array, where: Pattern | None) -> Array:
+def _moved_packed(a: Array, packed: Array, where: Pattern | None) -> Array:
     """a P a', packed."""
     n, batch = a.shape[0], packed.ndim - 1
     where = where or full(n, n)
     if batch == 0:
-        return _pick(multiplied(multiplied(a, _spread(packed)), a.T))
+        return _pick_upper(multiplied(multiplied(a, _spread_full(packed)), a.T))
     # A shared dense a: vec(a P a') = (a x a) vec(P) is one product with all runs as columns. A
     # sparse one takes fewer operations term by term.
     if a.size == n * n and 2 * sum(map(sum, where)) > n * n:
-        return _shared(a, packed)
+        return _shared_congruence(a, packed)
     # a P first, then (a P) a': two loops of n terms. As one expression each element would be a sum
     # of n^2 terms, which XLA cuts into loops that threads share (fast/README.md: "Loops inside a
     # step stay undivided").
-    half = stage(_half(where), a, packed, batch=batch)
+    half = stage(_half_product(where), a, packed, batch=batch)
     rows, cols = np.triu_indices(n)
     return total(half[rows, k[cols]] * f[cols] for f, k in by_row(a, where))
 
 
-def _shared(a: Array, packed: Array) -> Array:
+def _shared_congruence(a: Array, packed: Array) -> Array:
     """a P a' as one product with the second power of an a without a batch."""
     power = stage(_second_power, a, batch=packed.ndim - 1).reshape(len(packed), len(packed))
     moved = lax.dot(power, packed.reshape(len(packed), -1), precision=lax.Precision.HIGHEST)

@@ -69,7 +69,7 @@ def triangularise(a: Array) -> Array:
     rows = [a[i] for i in range(n)]
     lower = [[jnp.zeros((), a.dtype)] * n for _ in range(n)]
     for i in range(n):
-        unit, lower[i][i] = _normalised(rows[i])
+        unit, lower[i][i] = _normalised_row(rows[i])
         for j in range(i + 1, n):
             lower[j][i] = rows[j] @ unit
             rows[j] = rows[j] - lower[j][i] * unit
@@ -77,7 +77,7 @@ def triangularise(a: Array) -> Array:
 
 
 @jax.custom_jvp
-def _normalised(row: Array) -> tuple[Array, Array]:
+def _normalised_row(row: Array) -> tuple[Array, Array]:
     """A row over its length, and the length; zeros of zeros."""
     square = row @ row
     kept = square > 0
@@ -85,11 +85,11 @@ def _normalised(row: Array) -> tuple[Array, Array]:
     return row * reciprocal, square * reciprocal
 
 
-@_normalised.defjvp
+@_normalised_row.defjvp
 def _normalised_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
     """Written out, because the derivative of a reciprocal root overflows where `least_root` cubed
     underflows."""
-    (unit, length), (change,) = _normalised(*primals), tangents
+    (unit, length), (change,) = _normalised_row(*primals), tangents
     longer = unit @ change
     kept = length > 0
     across = (change - longer * unit) / jnp.where(kept, length, 1)

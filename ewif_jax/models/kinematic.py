@@ -153,20 +153,20 @@ def _motion_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients and powers (order + 1, order + 1) of F: dt^(j - i) / (j - i)!."""
     i, j = np.indices((order + 1, order + 1))
     power = np.maximum(j - i, 0)
-    return np.where(j >= i, 1 / _factorials(power), 0), power
+    return np.where(j >= i, 1 / _factorial_of(power), 0), power
 
 
 def _white_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of white noise on the highest derivative: integral of the propagated noise."""
     a, c = order - np.indices((order + 1, order + 1))
-    return 1 / (_factorials(a) * _factorials(c) * (a + c + 1)), a + c + 1
+    return 1 / (_factorial_of(a) * _factorial_of(c) * (a + c + 1)), a + c + 1
 
 
 def _held_terms(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Q of the next derivative held constant over the interval (DWNA for order 1)."""
     a, c = order + 1 - np.indices((order + 1, order + 1))
-    return 1 / (_factorials(a) * _factorials(c)), a + c
+    return 1 / (_factorial_of(a) * _factorial_of(c)), a + c
 
 
-def _factorials(x: np.ndarray) -> np.ndarray:
+def _factorial_of(x: np.ndarray) -> np.ndarray:
     return np.vectorize(factorial)(x)

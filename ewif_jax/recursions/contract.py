@@ -109,7 +109,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
         if recursion.inverts_prior and prior is not None:
             checks.psd("prior.cov", prior.cov, definite=True)
         if prior is None:
-            return start(params, None, _floating(t0), key)
+            return start(params, None, _floating_time(t0), key)
         mean = jnp.asarray(prior.mean)
         given = Gaussian(mean, jnp.asarray(prior.cov, mean.dtype))
         return start(params, given, jnp.asarray(t0, mean.dtype), key)
@@ -174,6 +174,6 @@ def offered(
     return updated, info._replace(delay=state.time - measurement.time, status=status)
 
 
-def _floating(t0: Numbers) -> Array:
+def _floating_time(t0: Numbers) -> Array:
     t0 = jnp.asarray(t0)
     return t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)

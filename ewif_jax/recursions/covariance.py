@@ -52,7 +52,7 @@ def covariance_recursion(
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
         cov = symmetric.congruence(F, state.cov, patterns(model)[0])
         if inflation is not None:
-            cov = _inflated(cov, inflation(params, state.time, time))
+            cov = _inflated_cov(cov, inflation(params, state.time, time))
         return CovarianceState(time, mean, cov + symmetric.pack(Q))
 
     def measure_now(
@@ -88,17 +88,17 @@ def unseen(H: Array, still: int) -> Array:
     return jnp.pad(H, ((0, 0), (0, still))) if still else H
 
 
-def _inflated(cov: Array, factor: Array) -> Array:
+def _inflated_cov(cov: Array, factor: Array) -> Array:
     # Only the variances grow by the extra share: more variance and equal covariances keep a matrix
     # positive definite, where equal factors would keep it singular to rounding.
-    factor = _saturated(factor, cov)
+    factor = _saturated_factor(factor, cov)
     rows, cols = np.triu_indices(symmetric.order(cov))
     variances = jnp.asarray(rows == cols, cov.dtype)
     rounding = cholesky.negligible(symmetric.order(cov), cov.dtype) * (1 - 1 / factor)
     return cov * factor * (1 + rounding * variances)
 
 
-def _saturated(factor: Array, cov: Array) -> Array:
+def _saturated_factor(factor: Array, cov: Array) -> Array:
     factor = jnp.minimum(jnp.asarray(factor, cov.dtype), 1 / jnp.finfo(cov.dtype).eps)
     ceiling = jnp.sqrt(jnp.finfo(cov.dtype).max)
     # One factor for all elements, from the largest: elements cut off one by one would be no

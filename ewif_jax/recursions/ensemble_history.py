@@ -80,7 +80,7 @@ def delayed(
             # The forecasts of all slots meet the noise that the members met, so that what differs
             # between them is the measurements alone.
             past = past._replace(ahead=jax.vmap(carried)(past.ahead))
-        past = choose(state.used, _pushed(past, state, now.members), past)
+        past = choose(state.used, _pushed_slots(past, state, now.members), past)
         left = EnsembleHistory(*now, jnp.asarray(False), past)
         return choose(time > state.time, left, state)
 
@@ -94,7 +94,7 @@ def delayed(
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
         then = jnp.minimum(measurement.time, state.time)
         there = retrodict(
-            params, state, _interpolated(state, then), then, ensembles.back_key(state.sight)
+            params, state, _interpolated_at(state, then), then, ensembles.back_key(state.sight)
         )
         # Nothing was learned since "now", and a regression on rounding would move the members.
         there = jnp.where(then < state.time, there, state.members)
@@ -116,13 +116,13 @@ def present(state: EnsembleHistory) -> EnsembleState:
     return EnsembleState(*state[:4])
 
 
-def _pushed(past: Slots, left: EnsembleHistory, now: Array) -> Slots:
+def _pushed_slots(past: Slots, left: EnsembleHistory, now: Array) -> Slots:
     """The slots with the ensemble that was left in front; its forecast is what it became, `now`."""
     entry = Slots(left.time, left.members, None if past.ahead is None else now)
     return jax.tree.map(lambda new, old: jnp.concatenate([new[None], old[:-1]]), entry, past)
 
 
-def _interpolated(state: EnsembleHistory, time: Array) -> Bracket:
+def _interpolated_at(state: EnsembleHistory, time: Array) -> Bracket:
     """Eq. (26) between the newest entry not newer than `time` and the next one, which may be now;
     forecasts likewise."""
     past = state.past

@@ -220,7 +220,7 @@ def fuse_ensembles(ensembles: Numbers) -> Array:
         checks.shape(f"ensembles[{k}]", x, ("n", "N"))
         checks.shape(f"ensembles[{k}]", x, level[0].shape)
     while len(level) > 1:
-        pairs = [_fused(a, b) for a, b in zip(level[::2], level[1::2], strict=False)]
+        pairs = [_fused_pair(a, b) for a, b in zip(level[::2], level[1::2], strict=False)]
         level = pairs + level[2 * len(pairs) :]
     return level[0]
 
@@ -232,5 +232,5 @@ def uncorrelated(members: Array, d: Array) -> Array:
     return members - matmul(weights.T, d)
 
 
-def _fused(first: Array, second: Array) -> Array:
+def _fused_pair(first: Array, second: Array) -> Array:
     return uncorrelated(first, first - second)

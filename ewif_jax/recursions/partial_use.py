@@ -39,14 +39,14 @@ def partly(estimator: Estimator, share: Array) -> Estimator:
             updated = updated._replace(share=state.share)
         else:
             updated, info = estimator.update(params, state, measurement)
-            updated = _mixed(state, updated, share)
+            updated = _mixed_states(state, updated, share)
         return updated, info._replace(log_likelihood=share * info.log_likelihood)
 
     init, predict, _, estimate = estimator[:4]
     return Estimator(init, predict, update, estimate, model=estimator.model)
 
 
-def _mixed(old: PyTree, new: PyTree, share: Array) -> Any:
+def _mixed_states(old: PyTree, new: PyTree, share: Array) -> Any:
     """(1 - share) old + share new, in what makes up the estimate."""
     if isinstance(old, InformationState):
         return information.blended(old, new, share)
@@ -55,9 +55,9 @@ def _mixed(old: PyTree, new: PyTree, share: Array) -> Any:
         plain, "softness", "an estimator with means and a covariance as state", type(old).__name__
     )
     # P - g K S K' = (1 - g) P + g (P - K S K'): a mixture of two covariances, so it is one.
-    mean, cov = _mix((old.mean, old.cov), (new.mean, new.cov), share)
+    mean, cov = _mix_leaves((old.mean, old.cov), (new.mean, new.cov), share)
     return new._replace(mean=mean, cov=cov)
 
 
-def _mix(old: PyTree, new: PyTree, share: Array) -> Any:
+def _mix_leaves(old: PyTree, new: PyTree, share: Array) -> Any:
     return jax.tree.map(lambda a, b: a + share * (b - a), old, new)

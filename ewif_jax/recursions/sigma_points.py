@@ -83,8 +83,8 @@ def flow_around(
     all but the last `still` components, which do not move."""
     if points is None or model.linear is not None:
         return predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
-    root = _root(cov, mean.shape[0] - still)
-    moved, line = _moved(model, points, params, mean, root.lower, t0, t1, still)
+    root = _divisible_root(cov, mean.shape[0] - still)
+    moved, line = _moved_line(model, points, params, mean, root.lower, t0, t1, still)
     Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
     return moved, sigma_points.slope_of(line, root), line.left_over + Q
 
@@ -97,7 +97,7 @@ def move_around(
         moved, F, Q = predict_state(model, params, mean, t0, t1)
         return moved, symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
     lower = _fine_root(cov, mean.shape[0])
-    moved, line = _moved(model, points, params, mean, lower, t0, t1)
+    moved, line = _moved_line(model, points, params, mean, lower, t0, t1)
     Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
     return moved, symmetric.pack(matmul(line.slope, line.slope.T) + line.left_over + Q)
 
@@ -120,10 +120,10 @@ def measure_around(
     def apart(x: Array, y: Array) -> Array:
         return model.residual(x, y, sensor)
 
-    root = _root(cov, n) if still else None
+    root = _divisible_root(cov, n) if still else None
     exact = ~cholesky.factor(gaussian.mask_cov(jnp.asarray(R, mean.dtype), mask)).full_rank
     lower = _fine_root(cov, n, exact) if root is None else root.lower
-    predicted, line = _regressed(see, apart, points, params, mean, lower, still)
+    predicted, line = _regressed_line(see, apart, points, params, mean, lower, still)
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
     # After an exact measurement the points differ by rounding only, as the members of ensembles do.
@@ -143,7 +143,7 @@ def measure_around(
     return mean, cov, info_of(innovation, mask, good)
 
 
-def _root(cov: Array, n: int) -> cholesky.Factor:
+def _divisible_root(cov: Array, n: int) -> cholesky.Factor:
     """The factor of the first n components' part of a packed `cov`, to be divided by."""
     return cholesky.factor(symmetric.unpack(cov)[:n, :n])
 
@@ -157,7 +157,7 @@ def _fine_root(cov: Array, n: int, exact: Array | bool = False) -> Array:
     return cholesky.factor(symmetric.unpack(cov), eps, size).lower
 
 
-def _moved(
+def _moved_line(
     model: Model,
     points: SigmaPoints,
     params: Params,
@@ -172,10 +172,10 @@ def _moved(
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    return _regressed(move, jnp.subtract, points, params, mean, lower, still)
+    return _regressed_line(move, jnp.subtract, points, params, mean, lower, still)
 
 
-def _regressed(
+def _regressed_line(
     f: Callable[[Array], Array],
     apart: Callable[[Array, Array], Array],
     points: SigmaPoints,

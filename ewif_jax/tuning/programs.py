@@ -76,22 +76,22 @@ class Objective(NamedTuple):
     def evaluate(self, points: list[Leaves], held: Leaves, key: RandomKey) -> list[Priced]:
         """Value and slopes at each of the points, in one call if there are several."""
         if len(points) == 1:
-            values, slopes = self.program("single", _single)(points[0], held, key)
+            values, slopes = self.program("single", _single_program)(points[0], held, key)
             return [(float(values), [np.asarray(x) for x in slopes])]
         stacked = tuple(jnp.stack(leaves) for leaves in zip(*points, strict=True))
-        values, slopes = self.program("many", _many)(stacked, held, key)
+        values, slopes = self.program("many", _many_program)(stacked, held, key)
         values, slopes = np.asarray(values), [np.asarray(x) for x in slopes]
         return [(float(values[k]), [x[k] for x in slopes]) for k in range(len(points))]
 
 
-def _single(objective: Objective) -> Callable[..., Any]:
+def _single_program(objective: Objective) -> Callable[..., Any]:
     def evaluated(moving: Leaves, held: Leaves, key: RandomKey) -> tuple[Array, Any]:
         return value_and_gradient(objective.value, moving, held, key)
 
     return jax.jit(evaluated)
 
 
-def _many(objective: Objective) -> Callable[..., Any]:
+def _many_program(objective: Objective) -> Callable[..., Any]:
     def evaluated(moving: Leaves, held: Leaves, key: RandomKey) -> tuple[Array, Any]:
         return value_and_gradient(objective.value, moving, held, key)
 
