@@ -61,6 +61,8 @@ def value_charges(
         error = xp.where(present, error, 0)
     charge = cost(error, xp.where(present, spread, 1), present)
     largest = float(jnp.finfo(float_dtype(measurements.value)).max) ** 0.5
+    # A value whose square no float holds costs infinity for all parameters: no predictor is right
+    # about it, and a finite charge would reward losing that row.
     too_large = (abs(value) > largest).any(-1)
     charge = xp.where(too_large | xp.isnan(charge), xp.inf, charge)
     return _in_dtype(xp.where(counted, charge, xp.nan), measurements.value)
@@ -71,6 +73,9 @@ def _foreseen_rows(mask: Numbers, unknowns: int, ahead: int) -> Any:
     been."""
     measured = mask.any(-1)
     components = mask.sum(-1).cumsum(-1)
+    # Counted from the masks alone: whether the numbers determine a state depends on parameters, and
+    # a loss whose rows parameters choose can be lowered by choosing fewer
+    # (docs/decisions/tuning.md).
     first = (measured & (components < unknowns)).sum(-1, keepdims=True) + (unknowns > 0)
     earlier = measured.cumsum(-1) - measured
     # With a prior the first rows are predicted from that.
@@ -174,6 +179,8 @@ def _about_the_mean(value: Numbers, present: Numbers, sensor: Numbers) -> tuple[
     if xp is np:
         _, group = np.unique(which, return_inverse=True)
     else:
+        # With traced sensors the number of groups is not known: as many as rows, most of them
+        # empty.
         _, group = jnp.unique(which, return_inverse=True, size=which.size)
     group = group.reshape(-1)
     groups = int(group.max()) + 1 if xp is np else which.size

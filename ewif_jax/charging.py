@@ -150,6 +150,7 @@ def charging_of(
         return xp.where(xp.broadcast_to(counts, shape), charge, xp.nan)
 
     @cache
+    # Charges depend on the data alone, so all evaluations of a loss share them.
     def kept(unknowns: int) -> Any:
         # Else what is made of known numbers inside of a trace would belong to that trace.
         with jax.ensure_compile_time_eval():

@@ -131,6 +131,8 @@ def representable(
     runs = max((len(value) for _, value in finer), default=0)
     if not finer:
         return
+    # All clocks of a run together, sorted: an interval between a stamp and a report time is asked
+    # of the model as well as one between two stamps.
     pool = np.concatenate([np.broadcast_to(x, (runs, x.shape[1])) for _, x in finer], 1)
     ordered = np.sort(pool, axis=1, kind="stable")
     with np.errstate(over="ignore", invalid="ignore"):

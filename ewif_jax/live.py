@@ -103,6 +103,8 @@ def step_batch(
     marks = ranked(measurement, (0, 1, 0, 1))
     same_runs("measurement", measurement, marks, runs)
     _check_steps_of_tracks(estimator, state, measurement)
+    # Tracks with the lowest parameters are where a variance would be negative first; to check all R
+    # one by one would take longer than the step.
     for k in {0, *lowest(params, flags)}:
         own = one_run((params, measurement), (flags, marks), k)
         _check_arrival(
@@ -234,6 +236,8 @@ def _stepped_batch(
         return _stepped_runs(estimator, params, state, arrived[0])
 
     def all_tracks(params: Params, states: State, measurement: Measurement) -> tuple[Any, Any]:
+        # One arrival is a stream of length 1: so the loop of `run_batch`, with its groups and
+        # shared parts, does the step of many tracks too.
         alone = jax.tree.map(
             lambda x, f: x[:, None] if f else jnp.asarray(x)[None], measurement, marks
         )

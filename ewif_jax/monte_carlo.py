@@ -154,6 +154,8 @@ def monte_carlo(
         # Filled up with repetitions, so that the last chunk is not compiled again.
         index = np.minimum(np.arange(begin, begin + chunk), runs - 1)
         some = jax.tree.map(lambda x, f, i=index: x[i] if f else x, params, marked)
+        # A run's keys come from its number, not from its place in a chunk: chunk and device count
+        # change no number.
         keys, own_keys = run_keys(key, index)
         simulation = simulate_batch(scenario, keys)
         values = scored(
@@ -240,6 +242,8 @@ def simulate_batch(scenario: Scenario, keys: Array, params: Params = None) -> Si
         params: of a scenario that takes parameters, in place of its own.
     """
     params = scenario.params if params is None else params
+    # Which parts depend on the key is read off the equations: common times stay one array, and a
+    # batch of filters then computes its gains once.
     flags = dependence(traced(one_run(scenario), keys[0], params), (True, _all_false(params)))
     # A scenario of a builder is compiled once for all that are equal; one made by hand may hold
     # arrays, which cannot be compared.

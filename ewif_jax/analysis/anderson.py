@@ -156,12 +156,16 @@ def _actual_error(
 
         return lax.scan(body, cov0, (truth, gain))[1]
     mean = jnp.zeros(n, cov0.dtype) if mean0 is None else jnp.asarray(mean0)
+    # Second moments of (x, e) at the start: E[x x'] = P0 + m m', and e = x - m.
     moments = jnp.block([[cov0 + jnp.outer(mean, mean), cov0], [cov0, cov0]])
     eye = jnp.eye(n, dtype=cov0.dtype)
 
     def both(S: Array, step: tuple[System, System, Array]) -> tuple[Array, Array]:
         (F, H, Q, R), (F_used, H_used, _, _), K = step
         left, kept = eye - K @ H, (eye - K @ H_used) @ F_used
+        # e+ = (I - K H) (F x + w) - (I - K H_d) F_d (x - e) - K v: the block under F is what the
+        # design gets wrong of the state, and vanishes where both systems agree
+        # (docs/decisions/analysis.md).
         move = jnp.block([[F, jnp.zeros_like(F)], [left @ F - kept, kept]])
         noise = jnp.block([[Q, Q @ left.T], [left @ Q, left @ Q @ left.T + K @ R @ K.T]])
         S = _made_symmetric(move @ S @ move.T + noise)

@@ -164,6 +164,7 @@ def _error_curve(
         leak = world.F - now.F - K @ (world.H - now.H)
         move = jnp.block([[world.F, jnp.zeros_like(leak)], [leak, now.F - K @ now.H]])
         driven = world.noise + K @ world.R @ K.T
+        # State and error share the process noise w; the measurement noise enters the error alone.
         noise = jnp.block([[world.noise, world.noise], [world.noise, driven]])
         moved = move @ both
         return symmetric.pack(moved + moved.T + noise), symmetric.pack(now.slope(cov))
@@ -172,6 +173,8 @@ def _error_curve(
         first, field = cov0, own
     else:
         real = matrices(functions[1], constants[1], params)
+        # E[x x'] = P0 + m m', and the error x - m at the start has covariance P0 with x and with
+        # itself: the estimate starts at the mean.
         first = jnp.block([[cov0 + jnp.outer(mean0, mean0), cov0], [cov0, cov0]])
         field = other
     found, design = solve(field, (symmetric.pack(first), symmetric.pack(cov0)), times, *tolerances)

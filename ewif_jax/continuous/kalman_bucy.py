@@ -111,6 +111,8 @@ def _kalman_bucy(
         z = jax.vmap(lambda v: jnp.interp(t, signal.time, v), in_axes=1)(signal.value)
         return now.F @ mean + K @ (z - now.H @ mean), symmetric.pack(now.slope(cov))
 
+    # The covariance is integrated as its upper triangle: it stays symmetric, and the solver's error
+    # control counts each number once.
     start = prior.mean, symmetric.pack(prior.cov)
     mean, packed = solve(field, start, times, *tolerances, kinks=signal.time)
     cov = jax.vmap(symmetric.unpack)(packed)
@@ -135,6 +137,7 @@ class Instant(NamedTuple):
         """The right-hand side of (4-2), (n, n)."""
         K = self.gain(cov)
         moved = self.F @ cov
+        # (4-2): the weighting adds alpha I to F on both sides, which is 2 alpha Pi.
         return moved + moved.T + 2 * self.fading_rate * cov - K @ self.R @ K.T + self.noise
 
 
@@ -182,6 +185,8 @@ def solve(
     tolerances = diffrax.PIDController(
         rtol=rtol or (1e-9 if double else 1e-5), atol=atol or (1e-11 if double else 1e-7)
     )
+    # An adaptive step across a kink of the interpolated signal would be refused over and over until
+    # it is tiny: the solver steps to each sample instead.
     stops = times if kinks is None else jnp.concatenate([times, kinks])
     stepping = diffrax.ClipStepSizeController(tolerances, step_ts=jnp.sort(stops))
     return diffrax.diffeqsolve(

@@ -59,6 +59,8 @@ def _projected_certain(rest: Array, variances: Array, floor: Array) -> tuple[Arr
 def _without_last(rest: Array, weighted: Array, variance: Array) -> tuple[Array, Array, Array]:
     some = variance > 0
     reciprocal = jnp.where(some, 1 / jnp.where(some, variance, 1), 0)
+    # The part of each other vector along the last one, in the inner product weighted by variances:
+    # what is left over has errors independent of that component's.
     column = jnp.sum(rest[:-1] * weighted[None], 1) * reciprocal[None]
     one = jnp.ones((1, *column.shape[1:]), column.dtype)
     return rest[:-1] - column[:, None] * rest[-1][None], jnp.concatenate([column, one]), variance

@@ -69,6 +69,8 @@ def triangularise(a: Array) -> Array:
     rows = [a[i] for i in range(n)]
     lower = [[jnp.zeros((), a.dtype)] * n for _ in range(n)]
     for i in range(n):
+        # Each row is taken out of all later ones at once (modified): taken out of the original rows
+        # (classical), rounding would leave them far from orthogonal (Bjorck 1967).
         unit, lower[i][i] = _normalised_row(rows[i])
         for j in range(i + 1, n):
             lower[j][i] = rows[j] @ unit
@@ -90,6 +92,7 @@ def _normalised_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any,
     """Written out, because the derivative of a reciprocal root overflows where `least_root` cubed
     underflows."""
     (unit, length), (change,) = _normalised_row(*primals), tangents
+    # d|row| = unit . d row, and d unit is what of d row is across unit, over the length.
     longer = unit @ change
     kept = length > 0
     across = (change - longer * unit) / jnp.where(kept, length, 1)

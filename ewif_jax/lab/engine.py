@@ -117,6 +117,8 @@ def _by_executor(
     implementation = (
         str(jax.random.key_impl(design.key)) if checks.is_typed_key(design.key) else None
     )
+    # Once for all units: workers keep the unpacked design, and with it what they have compiled for
+    # it, as long as the bytes are equal.
     job = cloudpickle.dumps((design._replace(key=key), dict(tuned), implementation, x64))
     left = dict.fromkeys(units)
     try:

@@ -193,6 +193,8 @@ def _reduced_scores(
         score = seen["scores"][name]
         if converged is not None:
             good = score <= converged  # NaN is not
+            # A running minimum from the end: 1 from the first row on after which the score never
+            # exceeds the limit again.
             stays = jnp.flip(jax.lax.cummin(jnp.flip(good.astype(jnp.int32), 1), axis=1), 1)
             first = jnp.argmax(stays, 1)
             since = jnp.take_along_axis(times, first[:, None], 1)[:, 0] - t0

@@ -195,6 +195,8 @@ def _remembered_summary(state: SummaryState, measurement: Measurement) -> Summar
     now = CovarianceState(state.time, mean, symmetric.pack(cov))
     late = measurement.time < state.time
     taken = measurement._replace(time=state.time, mask=measurement.mask & ~late)
+    # A second late measurement at one filter time rewrites the summary: two entries of one time
+    # would count the interval of no length as a step of the smoother.
     again = late & (state.past.time[0] == state.time)
     pushed = jax.tree.map(
         lambda row, table: jnp.concatenate([row[None], table[:-1]]),

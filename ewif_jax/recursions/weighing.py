@@ -91,6 +91,8 @@ def compared(model: Model, params: Params, particles: Array, measurement: Measur
     predicted = jax.vmap(predict_value, -1, -1)(particles)
     subtracted = jax.vmap(lambda seen: model.residual(value, seen, sensor), -1, -1)(predicted)
     difference = jnp.where(mask[:, None], subtracted, 0)
+    # Particle by particle: one that has run away gets weight zero, the others still see the
+    # measurement.
     numbers = jnp.all(jnp.isfinite(jnp.square(difference)), 0)
     R = gaussian.mask_cov(R, mask)
     difference = jnp.where(numbers, difference, 0)
@@ -172,9 +174,13 @@ def weigh(
     explained = jnp.any(joint > -jnp.inf)
     # Minus infinity everywhere has no derivative: what is refused is not computed with.
     joint = jnp.where(explained, joint, state.log_weights)
+    # Old weights sum to one, so this is the log of the mean density under them; subtracting it
+    # normalises the new ones in the same step, without leaving logarithms.
     evidence = logsumexp(joint)
     log_weights, accepted = joint - evidence, explained
     if collapse is not None:
+        # The ratio of effective sizes and not the size itself: a cloud that was thin before is not
+        # the late measurement's fault (Orguner & Gustafsson, section IV).
         before, after = (effective_sample_size(w) for w in (state.log_weights, log_weights))
         is_late = measurement.time < state.time
         accepted = explained & ~(is_late & (after * collapse < before))
