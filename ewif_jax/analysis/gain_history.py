@@ -68,8 +68,8 @@ def _gains_along(F: Array, H: Array, Q: Array, R: Array, cov: Array, lag: int) -
     m, n = H.shape
     eye = jnp.eye(n, dtype=F.dtype)
 
-    # Backwards in age: the weights of all earlier measurements are carried by one product with (I -
-    # K H) F, so a history of `lag` costs no more than the filter.
+    # The weights of all earlier measurements move alike, by (I - K H) F: one product for all, and
+    # no power of a matrix is formed.
     def body(carry: tuple, motion: tuple[Array, Array]) -> tuple[tuple, GainHistory]:
         cov, gains, initial = carry
         K = gain(cov, H, R)

@@ -193,7 +193,7 @@ def alpha_beta_gains(index: Numbers) -> tuple[Array, Array]:
         ValueError: index < 0.
     """
     index = jnp.asarray(checks.at_least("index", index, 0.0))
-    # Two roots, not the root of lambda^2 + 8 lambda: the square of a small lambda would underflow.
+    # Two roots, not the root of lambda^2 + 8 lambda: the square of a large lambda would overflow.
     travel = index + jnp.sqrt(index) * jnp.sqrt(index + 8)
     rest = travel / (4 + travel)
     return rest * (2 - rest), 2 * rest**2
