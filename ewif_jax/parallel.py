@@ -116,11 +116,11 @@ def _run_parallel(
         state, passed = stretch
         kept = arrive(estimator, params, state, measurement).kept
         leg = way.passage(model, params, growing, state.time, kept.time, dtype)
-        return kept, way.then(passed, leg)
+        return kept, way.both_passages(passed, leg)
 
     def after(state: InformationState, stretch: Stretch) -> InformationState:
         own, passed = stretch
-        return form.recentred(form.joined(way.carried(state, passed, own.time), own))
+        return form.recentred(form.joined(way.carried_over(state, passed, own.time), own))
 
     def filtered(state: InformationState, arrival: tuple[Measurement, Array]) -> tuple[Any, Any]:
         measurement, time = arrival
@@ -157,7 +157,7 @@ def _carried_in(
         return lax.scan(lambda state, s: (after(state, s), state), start, stretches)[1]
 
     def together(first: Stretch, second: Stretch) -> Stretch:
-        return after(first[0], second), way.then(first[1], second[1])
+        return after(first[0], second), way.both_passages(first[1], second[1])
 
     def pairwise(firsts: Stretch, seconds: Stretch) -> Stretch:
         none = seconds[0].time.size == 0  # the prefix sum of two asks for this

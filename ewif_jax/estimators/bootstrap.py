@@ -70,14 +70,18 @@ def bootstrap(
 
     def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
-        return form.drawn(kind, prior, t0, key)
+        return form.drawn_particles(kind, prior, t0, key)
 
     def measure(
         params: Params, state: ParticleState, measurement: Measurement
     ) -> tuple[ParticleState, Info]:
-        seen = weighing.look(model, params, state.particles, state.log_weights, measurement)
+        seen = weighing.look_of_cloud(
+            model, params, state.particles, state.log_weights, measurement
+        )
         log_weights, info = weighing.weigh(state, seen, measurement)
         return state._replace(log_weights=log_weights), info
 
-    recursion = Recursion("bootstrap", start, form.mover(kind), measure, form.estimate, model=model)
+    recursion = Recursion(
+        "bootstrap", start, form.mover(kind), measure, form.estimate_of_cloud, model=model
+    )
     return estimator_from(recursion._replace(draws=True, estimated=("particles",)))

@@ -69,23 +69,25 @@ def ensemble(
         return ensembles.drawn(prior, t0, key, count)
 
     def move(params: Params, state: EnsembleState, time: Array) -> EnsembleState:
-        return ensembles.moved(model, params, state, time)[0]
+        return ensembles.moved_members(model, params, state, time)[0]
 
     def measure(
         params: Params, state: EnsembleState, measurement: Measurement
     ) -> tuple[EnsembleState, Info]:
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
-        looked = ensembles.look(model, params, state.members, state.members, measurement)
+        looked = ensembles.look_of_ensemble(
+            model, params, state.members, state.members, measurement
+        )
         if form == "stochastic":
             members = ensembles.perturbed(state.members, looked, own)
         else:
-            members = ensembles.transformed(state.members, looked)
+            members = ensembles.transformed_members(state.members, looked)
         info = info_of(looked.innovation, looked.mask, looked.all_finite)
         return state._replace(members=members, sight=sight), info
 
     def estimate(params: Params, state: EnsembleState) -> Gaussian:
         del params
-        return ensembles.moments(state.members)
+        return ensembles.sample_moments(state.members)
 
     recursion = Recursion("ensemble", start, move, measure, estimate, model=model)
     return estimator_from(recursion._replace(draws=True, estimated=("members",)))

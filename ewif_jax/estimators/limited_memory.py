@@ -19,7 +19,7 @@ from ewif_jax.recursions.invertible import refuse_exact
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params, RandomKey
 
 
-class WindowState(NamedTuple):
+class MemoryState(NamedTuple):
     """time (), start: what the prior says, buffer: the newest `capacity` measurements."""
 
     time: Array
@@ -62,7 +62,7 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
 
     def first_state(
         params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
-    ) -> WindowState:
+    ) -> MemoryState:
         del key
         checks.positive_number("window", resolve(window, params))
         refuse_exact(model, params, t0, "limited_memory")
@@ -77,9 +77,9 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
             jnp.zeros(capacity, jnp.int32),
             jnp.zeros((capacity, m), bool),
         )
-        return WindowState(start.time, start, buffer)
+        return MemoryState(start.time, start, buffer)
 
-    def fit(params: Params, state: WindowState, time: Array) -> InformationState:
+    def fit(params: Params, state: MemoryState, time: Array) -> InformationState:
         """Everything inside the window, at `time`."""
         half = resolve(window, params)
         inside = jnp.abs(time - state.start.time) <= half
@@ -100,17 +100,17 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         told, sizes = (x.reshape(-1, x.shape[-1]) for x in (told, sizes))
         return form.recentred(form.gathered(base, told, noise.ravel(), targets.ravel(), sizes))
 
-    def move(params: Params, state: WindowState, time: Array) -> WindowState:
+    def move(params: Params, state: MemoryState, time: Array) -> MemoryState:
         del params
         return state._replace(time=time)
 
-    def is_inside(params: Params, state: WindowState, time: Array) -> Array:
+    def is_inside(params: Params, state: MemoryState, time: Array) -> Array:
         in_window = state.time - time <= resolve(window, params)
         return in_window & (time >= jnp.min(state.buffer.time))
 
     def measure(
-        params: Params, state: WindowState, measurement: Measurement
-    ) -> tuple[WindowState, Info]:
+        params: Params, state: MemoryState, measurement: Measurement
+    ) -> tuple[MemoryState, Info]:
         # The oldest in validity time goes, not the first that came: a late measurement must not
         # push out a newer one.
         oldest = jnp.argmin(state.buffer.time)
@@ -119,7 +119,7 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
         _, info = form.absorb(model, params, before, measurement, 1.0)
         return state._replace(buffer=buffer), info
 
-    def estimate(params: Params, state: WindowState) -> Gaussian:
+    def estimate(params: Params, state: MemoryState) -> Gaussian:
         return form.estimate(fit(params, state, state.time))
 
     recursion = Recursion("limited_memory", first_state, move, measure, estimate, is_inside)

@@ -7,7 +7,9 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern
 
 
-def moved(F: Array, c: Array | None, mean: Array, where: Pattern | None) -> tuple[Array, Array]:
+def moved_with_rest(
+    F: Array, c: Array | None, mean: Array, where: Pattern | None
+) -> tuple[Array, Array]:
     """F mean + c (n,), and what rounding left of it over (n,); F may differ from zero `where`.
 
     Over a short interval a mean far from the origin moves by less than it is rounded by: 3 m/s for

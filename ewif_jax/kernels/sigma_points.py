@@ -53,7 +53,7 @@ def slope_of(line: Regression, root: cholesky.Factor) -> Array:
     return cholesky.backward(root, line.slope.T).T
 
 
-def update(
+def update_by_points(
     mean: Array, lower: Array, difference: Array, slope: Array, R: Array, mask: Array
 ) -> tuple[Array, Array, gaussian.Innovation]:
     r"""Mean and packed covariance of a Gaussian of covariance L L' after a measurement, with the

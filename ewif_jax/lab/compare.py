@@ -17,7 +17,7 @@ from ewif_jax.lab.design import Design, Limits, designed
 from ewif_jax.lab.engine import Unit, compute_unit, compute_units, not_there
 from ewif_jax.lab.identity import digest_of, source_fingerprint
 from ewif_jax.lab.methods import Method
-from ewif_jax.lab.moments import PairedMoments, combined, means, paired_moments
+from ewif_jax.lab.moments import PairedMoments, combined_pairs, means, paired_moments
 from ewif_jax.lab.progress import Progress
 from ewif_jax.lab.store import InFolder, InMemory, Store
 from ewif_jax.lab.tuned import tuned_params
@@ -175,7 +175,9 @@ def _until_enough(
             for name in design.metrics:
                 added = paired_moments(arrays[f"score/{name}"])
                 earlier = found[unit.point].get(name)
-                found[unit.point][name] = added if earlier is None else combined(earlier, added)
+                found[unit.point][name] = (
+                    added if earlier is None else combined_pairs(earlier, added)
+                )
         going = [
             p for p in going if chunks[p] < design.chunks and not _precise_enough(design, found[p])
         ]

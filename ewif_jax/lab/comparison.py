@@ -77,7 +77,9 @@ class Comparison:
                 {kind: moments.paired_moments(arrays[kind]) for kind in kinds}
                 for arrays in self.units(point)
             ]
-            joined = {kind: reduce(moments.combined, (x[kind] for x in parts)) for kind in kinds}
+            joined = {
+                kind: reduce(moments.combined_pairs, (x[kind] for x in parts)) for kind in kinds
+            }
             found.append(joined)
         return found
 
@@ -116,7 +118,9 @@ class Comparison:
         for number, point in enumerate(self.points):
             for name in self.design.metrics:
                 found, total = self._moments[number], self._totals[number]
-                rows += tables.rows(self.design, point, name, found, total, reference, details)
+                rows += tables.metric_rows(
+                    self.design, point, name, found, total, reference, details
+                )
         return pd.DataFrame(rows)
 
     def summary(self, reference: str | None = None, *, details: bool = False) -> str:

@@ -31,7 +31,7 @@ def paired_moments(scores: np.ndarray) -> PairedMoments:
     return PairedMoments(count, mean, squares, products)
 
 
-def combined(some: PairedMoments, others: PairedMoments) -> PairedMoments:
+def combined_pairs(some: PairedMoments, others: PairedMoments) -> PairedMoments:
     """Of both sets of runs (Chan, Golub and LeVeque 1979)."""
     count = some.count + others.count
     safe = np.maximum(count, 1)

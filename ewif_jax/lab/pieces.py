@@ -65,7 +65,7 @@ def read_piece(path: Path) -> Arrays:
         return dict(stored)
 
 
-def digest_of(path: Path) -> str:
+def digest_of_file(path: Path) -> str:
     """Of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

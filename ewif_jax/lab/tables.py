@@ -38,7 +38,7 @@ def counts(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def rows(
+def metric_rows(
     design: Design,
     point: Mapping[str, float],
     metric: str,
@@ -162,7 +162,7 @@ def netcdf_bytes(found: xr.Dataset) -> bytes:
     return buffer.getvalue()
 
 
-def shown(value: float, error: float) -> str:
+def shown_cells(value: float, error: float) -> str:
     """A value with as many digits as its error allows: "1.234 ± 0.012"."""
     if not np.isfinite(error) or error <= 0:
         return f"{value:.4g}"
@@ -177,7 +177,7 @@ def for_people(table: pd.DataFrame) -> pd.DataFrame:
     for name, error in {"value": "error", **errors}.items():
         if name in found:
             pairs = zip(found[name], found.pop(error), strict=True)
-            found[name] = [shown(*pair) for pair in pairs]
+            found[name] = [shown_cells(*pair) for pair in pairs]
     counted = ["without", "missing", *(status.name.lower() for status in Status)]
     counted = [name for name in counted if name in found]
     dull = [name for name in counted if not np.any(found[name].to_numpy())]

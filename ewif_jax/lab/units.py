@@ -22,7 +22,7 @@ Arrays = dict[str, np.ndarray]
 STATUSES = len(Status)
 
 
-class Seen(NamedTuple):
+class SeenArrival(NamedTuple):
     """What a score sees of an arrival besides the estimate: truth (k,), mask (m,), and a stand-in
     for an estimate that there is not."""
 
@@ -121,8 +121,8 @@ def _one_method(
         clock=told.clock,
         key=keys,
         observe=_score_observer(tuple(design.metrics.items())),
-        context=Seen(truth, jnp.asarray(stream.mask), over_steps),
-        context_per_run=Seen(truth.ndim == 3, stream.mask.ndim == 3, False),
+        context=SeenArrival(truth, jnp.asarray(stream.mask), over_steps),
+        context_per_run=SeenArrival(truth.ndim == 3, stream.mask.ndim == 3, False),
         devices=1,
     )
     times = stream.time if simulation.times is None else simulation.times
@@ -149,7 +149,7 @@ def _score_observer(metrics: tuple[tuple[str, Score], ...]) -> Observer:
     """Scores by name, what became of the measurement, and whether there was an estimate; one
     object for equal metrics, so that nothing is compiled again."""
 
-    def observe(step: Step, seen: Seen) -> dict[str, Any]:
+    def observe(step: Step, seen: SeenArrival) -> dict[str, Any]:
         is_absent = jnp.any(jnp.isnan(step.mean))
         shown = step._replace(
             mean=jnp.where(is_absent, seen.instead.mean, step.mean),

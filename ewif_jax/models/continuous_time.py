@@ -15,7 +15,7 @@ from ewif_jax.models import domain
 from ewif_jax.models.discrete import pattern_of_powers
 from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
 from ewif_jax.models.parameters import named
-from ewif_jax.models.powers import Stride, then
+from ewif_jax.models.powers import Stride, both_strides
 from ewif_jax.models.sensors import Sensor, bank
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import DTypeLike, Numbers, Parameter, Params
@@ -206,7 +206,7 @@ def _both_sides(A: Array, x: Array) -> Array:
 
 
 def _doubled_stride(stride: Stride) -> Stride:
-    return then(stride, stride, matmul, matvec)
+    return both_strides(stride, stride, matmul, matvec)
 
 
 def _given_matrix(argument: str, value: Numbers) -> Any:

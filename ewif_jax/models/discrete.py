@@ -13,7 +13,7 @@ from ewif_jax import checks
 from ewif_jax.fast.compiling import array, one_program
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models.parameters import named, of_params
-from ewif_jax.models.powers import Stride, chosen, looked_up, power, squares_of, tables_of
+from ewif_jax.models.powers import Stride, chosen_tree, looked_up, power, squares_of, tables_of
 from ewif_jax.models.steps import count_steps
 from ewif_jax.types import Numbers, Parameter, Params, Steps
 
@@ -101,14 +101,14 @@ def transition_of_steps(F: Parameter, steps: Steps) -> Function:
         eye = jnp.eye(first.shape[0], dtype=first.dtype)
         # In a batch all branches run: nothing is inverted or multiplied up that is not asked for,
         # or its derivative would be infinity times 0.
-        ahead, behind = chosen(k > 1, first, eye), chosen(k < 0, first, eye)
+        ahead, behind = chosen_tree(k > 1, first, eye), chosen_tree(k < 0, first, eye)
         return _first_case(
             [
                 (k > 1, lambda: power(Stride(ahead), k, steps).F),
                 (k == -1, lambda: _inverse_motion(behind)),
                 (k < -1, lambda: _motion_back(behind, -k, steps)),
             ],
-            lambda: chosen(k > 0, first, _no_change(eye, whole)),
+            lambda: chosen_tree(k > 0, first, _no_change(eye, whole)),
         )
 
     return matrix
@@ -148,7 +148,7 @@ def input_of_steps(F: Parameter, b: Parameter, steps: Steps) -> Function:
 
         return _first_case(
             [(k > 1, many)],
-            lambda: chosen(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
+            lambda: chosen_tree(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
         )
 
     return gathered
@@ -172,7 +172,7 @@ def noise_of_steps(F: Parameter, Q: Parameter, steps: Steps) -> Function:
 
         return _first_case(
             [(k > 1, many)],
-            lambda: chosen(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
+            lambda: chosen_tree(k > 0, first, _no_change(jnp.zeros_like(first), whole)),
         )
 
     return summed
@@ -192,8 +192,8 @@ def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
         k, whole = count_steps(steps, t0, t1)
 
         def single() -> Array:
-            step = chosen(k < 0, array(back), array(F))
-            return chosen(k == 0, _no_change(jnp.eye(F.shape[0]), whole), step)
+            step = chosen_tree(k < 0, array(back), array(F))
+            return chosen_tree(k == 0, _no_change(jnp.eye(F.shape[0]), whole), step)
 
         return _first_case([(abs(k) > 1, lambda: looked_up(tables, k).F)], single)
 
@@ -202,7 +202,7 @@ def _powers_of_constant(F: np.ndarray, steps: Steps) -> Function:
 
 def _no_change(still: Array, whole: Numbers) -> Array:
     """What no step does; NaN where the steps are not whole."""
-    return chosen(whole, still, jnp.full_like(still, jnp.nan))
+    return chosen_tree(whole, still, jnp.full_like(still, jnp.nan))
 
 
 def _first_step(

@@ -41,7 +41,7 @@ def tables_of(one: Stride, steps: Steps) -> list[Stride]:
         for _ in range(-(-steps.max_steps.bit_length() // BITS)):
             rows = [still, one]
             while len(rows) <= 2**BITS:
-                rows.append(then(rows[-1], one, np.matmul, np.matmul))
+                rows.append(both_strides(rows[-1], one, np.matmul, np.matmul))
             one = rows.pop()
             tables.append(jax.tree.map(lambda *x: np.stack(x), *rows))
     return tables
@@ -58,7 +58,7 @@ def looked_up(tables: list[Stride], k: Numbers) -> Stride:
         if len(table.F) > 2**BITS:
             row = row + 2**BITS * (k < 0)
         entry = jax.tree.map(lambda x, row=row: _table_row(array(x), row), table)
-        total = entry if total is None else then(total, entry, matmul, matvec)
+        total = entry if total is None else both_strides(total, entry, matmul, matvec)
         total = total._replace(F=total.F if table.b is None and table.Q is None else None)
     assert total is not None
     return total
@@ -85,18 +85,18 @@ def power(one: Stride, k: Numbers, steps: Steps, squares: np.ndarray | None = No
     still = Stride(*(None if x is None else jnp.zeros_like(x) for x in one))
     still = still._replace(F=jnp.eye(one.F.shape[0], dtype=one.F.dtype))
     total = still if one.b is None and one.Q is None else still._replace(F=None)
-    k = chosen(k > 0, k, 0)
+    k = chosen_tree(k > 0, k, 0)
 
     def digit(carry: tuple[Stride, Stride], now: tuple[Any, Any]) -> tuple[Any, None]:
         (total, square), (number, F) = carry, now
         square = square if F is None else square._replace(F=F)
-        here = chosen((k >> number) % 2 == 1, square, still)
+        here = chosen_tree((k >> number) % 2 == 1, square, still)
         # What no digit needs is never squared: it may overflow.
-        square = chosen(k >> (number + 1) > 0, square, still)
-        square = then(square, square, matmul, matvec)
+        square = chosen_tree(k >> (number + 1) > 0, square, still)
+        square = both_strides(square, square, matmul, matvec)
         if F is not None:
             square = square._replace(F=None)
-        return (then(total, here, matmul, matvec), square), None
+        return (both_strides(total, here, matmul, matvec), square), None
 
     # Squares of an F that is an array are known in float64: repeated squaring in float32 would
     # double the relative error at every digit.
@@ -112,7 +112,7 @@ def power(one: Stride, k: Numbers, steps: Steps, squares: np.ndarray | None = No
     return carry[0]
 
 
-def then(first: Stride, second: Stride, matmul: Callable, matvec: Callable) -> Stride:
+def both_strides(first: Stride, second: Stride, matmul: Callable, matvec: Callable) -> Stride:
     """What both do, one after the other; the F of the first may be left out."""
     b, Q = None, None
     if first.b is not None and second.b is not None:
@@ -122,7 +122,7 @@ def then(first: Stride, second: Stride, matmul: Callable, matvec: Callable) -> S
     return Stride(None if first.F is None else matmul(second.F, first.F), b, Q)
 
 
-def chosen(condition: Numbers, first: PyTree, second: PyTree) -> Any:
+def chosen_tree(condition: Numbers, first: PyTree, second: PyTree) -> Any:
     """`first` where the condition holds, else `second`."""
     is_concrete = checks.concrete_value(condition)
     if is_concrete is not None:

@@ -60,7 +60,7 @@ def enkf2(
         there, ahead, now = bracket.there, bracket.ahead, state.members
         if ahead is None:
             drawn = ensembles.process_noise(model, params, key, there, time, state.time)
-            ahead = ensembles.carried(model, params, there, time, state.time) + drawn
+            ahead = ensembles.carried_members(model, params, there, time, state.time) + drawn
         return ensembles.uncorrelated(there, _beyond_rounding(now - ahead, now))
 
     return delayed(model, "enkf2", members, lag, retrodict, forecasts=noise == "shared")

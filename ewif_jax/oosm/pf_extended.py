@@ -90,7 +90,7 @@ def pf_extended(
 
     def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> PathState:
         del params
-        first = form.drawn(kind, prior, t0, key)
+        first = form.drawn_particles(kind, prior, t0, key)
         times, past = copies((first.time, first.particles), lag)
         return PathState(*first, jnp.asarray(False), times, past)
 
@@ -125,7 +125,7 @@ def pf_extended(
             lambda cloud: (cloud, cloud.particles, in_order),
             ParticleState(*state[:4]),
         )
-        seen = weighing.look(model, params, there, cloud.log_weights, measurement)
+        seen = weighing.look_of_cloud(model, params, there, cloud.log_weights, measurement)
         log_weights, info = weighing.weigh(cloud, seen, measurement, collapse)
         cloud = cloud._replace(log_weights=log_weights)
         # The paths follow at the end, so that no branch has to copy them.
@@ -134,7 +134,7 @@ def pf_extended(
         )
         return state._replace(**cloud._asdict(), used=jnp.asarray(True), past=past), info
 
-    recursion = Recursion("pf_extended", start, move, measure, form.estimate, within_lag)
+    recursion = Recursion("pf_extended", start, move, measure, form.estimate_of_cloud, within_lag)
     recursion = recursion._replace(draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))
 

@@ -19,10 +19,10 @@ from ewif_jax.recursions import weighing
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.fixed_point import Conditional, fixed_point, given
-from ewif_jax.recursions.innovations import numbers
+from ewif_jax.recursions.innovations import are_finite
 from ewif_jax.recursions.particle_smoother import lines, look_back
 from ewif_jax.recursions.sigma_points import SigmaPoints, transform
-from ewif_jax.recursions.weighing import Seen
+from ewif_jax.recursions.weighing import SeenByCloud
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params
 
 Smoother = Literal["eks", "uks", "ps"]
@@ -113,7 +113,7 @@ def pf_fixed_point(
     points = SigmaPoints(ut_alpha, ut_beta, ut_kappa) if smoother == "uks" else None
 
     def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> SummaryState:
-        first = form.drawn(kind, prior, t0, key)
+        first = form.drawn_particles(kind, prior, t0, key)
         if points is not None:
             transform(points, params, 2 * prior.mean.shape[0], t0.dtype)
         told = CovarianceState(t0, prior.mean, symmetric.pack(prior.cov))
@@ -131,11 +131,13 @@ def pf_fixed_point(
     def measure(
         params: Params, state: SummaryState, measurement: Measurement
     ) -> tuple[SummaryState, Info]:
-        def in_sequence(state: SummaryState) -> tuple[Seen, Array]:
+        def in_sequence(state: SummaryState) -> tuple[SeenByCloud, Array]:
             weights = state.log_weights
-            return weighing.look(model, params, state.particles, weights, measurement), state.key
+            return weighing.look_of_cloud(
+                model, params, state.particles, weights, measurement
+            ), state.key
 
-        def smoothed(state: SummaryState) -> tuple[Seen, Array]:
+        def smoothed(state: SummaryState) -> tuple[SeenByCloud, Array]:
             key, ours = jax.random.split(state.key)
             stored = jax.tree.map(lambda x: x[::-1], state.measured)
             _, first = last_before(state.past, measurement.time)
@@ -152,7 +154,9 @@ def pf_fixed_point(
         weighed = state._replace(log_weights=log_weights, key=key)
         return _remembered_summary(weighed, measurement), info
 
-    recursion = Recursion("pf_fixed_point", start, form.mover(kind), measure, form.estimate)
+    recursion = Recursion(
+        "pf_fixed_point", start, form.mover(kind), measure, form.estimate_of_cloud
+    )
     recursion = recursion._replace(reach=within_lag, draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))
 
@@ -165,7 +169,7 @@ def _value_size(model: Model, params: Params, at: CovarianceState) -> int:
 
 def _look_through(
     model: Model, params: Params, past: Conditional, state: SummaryState, measurement: Measurement
-) -> Seen:
+) -> SeenByCloud:
     """A late measurement as it is seen by particles now, through the state at its time."""
     time, value, sensor, mask = measurement
 
@@ -175,17 +179,19 @@ def _look_through(
         checks.shape("measurement.value", value, (R.shape[0],))
         difference = jnp.where(mask, model.residual(value, predicted, sensor), 0)
         cov = gaussian.mask_cov(matmul(matmul(H, there.cov), H.T) + R, mask)
-        good = numbers(difference, cov, mask)
+        good = are_finite(difference, cov, mask)
         difference, cov = jnp.where(good, difference, 0), jnp.where(good, cov, R)
         innovation = gaussian.innovate(difference, H, cov, mask)
         return there.mean, predicted, innovation.cov, gaussian.log_density(innovation, mask), good
 
     there, predicted, cov, log_density, good = jax.vmap(seen_through, -1, -1)(state.particles)
-    innovation, spread = weighing.averaged(
+    innovation, spread = weighing.averaged_innovation(
         model, params, there, predicted, good, state.log_weights, measurement
     )
     cov = cov @ weighing.shares(state.log_weights, good) + spread
-    return Seen(jnp.where(good, log_density, -jnp.inf), innovation, weighing.judged(cov, good))
+    return SeenByCloud(
+        jnp.where(good, log_density, -jnp.inf), innovation, weighing.judged_cov(cov, good)
+    )
 
 
 def _remembered_summary(state: SummaryState, measurement: Measurement) -> SummaryState:

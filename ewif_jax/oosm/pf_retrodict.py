@@ -61,7 +61,7 @@ def pf_retrodict(
 
     def start(params: Params, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
         del params
-        return form.drawn(kind, prior, t0, key)
+        return form.drawn_particles(kind, prior, t0, key)
 
     def any_age(params: Params, state: ParticleState, time: Array) -> Array:
         del params, state, time
@@ -76,15 +76,15 @@ def pf_retrodict(
             Q = jnp.asarray(model.process_cov(params, then, state.time), state.time.dtype)
             # The noise comes off first and the motion after it, as (89) has them: x(k) = f(x(l)) +
             # v.
-            origin = state.particles - form.noise(key, Q, particles)
+            origin = state.particles - form.process_draws(key, Q, particles)
             return state, form.transported(model, params, origin, state.time, then)
 
         is_late = weighing.is_late(state, measurement)
         drawn, there = lax.cond(is_late, moved_back, lambda s: (s, s.particles), state)
-        seen = weighing.look(model, params, there, drawn.log_weights, measurement)
+        seen = weighing.look_of_cloud(model, params, there, drawn.log_weights, measurement)
         log_weights, info = weighing.weigh(drawn, seen, measurement, collapse)
         return drawn._replace(log_weights=log_weights), info
 
-    recursion = Recursion("pf_retrodict", start, form.mover(kind), measure, form.estimate)
+    recursion = Recursion("pf_retrodict", start, form.mover(kind), measure, form.estimate_of_cloud)
     recursion = recursion._replace(reach=any_age, draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))

@@ -70,12 +70,12 @@ def delayed(
         return EnsembleHistory(*first, jnp.asarray(False), past)
 
     def move(params: Params, state: EnsembleHistory, time: Array) -> EnsembleHistory:
-        now, noise_met = ensembles.moved(model, params, present(state), time)
+        now, noise_met = ensembles.moved_members(model, params, present(state), time)
         past = state.past
         if past.ahead is not None:
 
             def carried(x: Array) -> Array:
-                return ensembles.carried(model, params, x, state.time, time) + noise_met
+                return ensembles.carried_members(model, params, x, state.time, time) + noise_met
 
             # The forecasts of all slots meet the noise that the members met, so that what differs
             # between them is the measurements alone.
@@ -98,14 +98,14 @@ def delayed(
         )
         # Nothing was learned since "now", and a regression on rounding would move the members.
         there = jnp.where(then < state.time, there, state.members)
-        looked = ensembles.look(model, params, state.members, there, measurement)
+        looked = ensembles.look_of_ensemble(model, params, state.members, there, measurement)
         members = ensembles.perturbed(state.members, looked, own)
         info = info_of(looked.innovation, looked.mask, looked.all_finite)
         return state._replace(members=members, sight=sight, used=jnp.asarray(True)), info
 
     def estimate(params: Params, state: EnsembleHistory) -> Gaussian:
         del params
-        return ensembles.moments(state.members)
+        return ensembles.sample_moments(state.members)
 
     recursion = Recursion(method, start, move, measure, estimate, within_lag, model=model)
     return estimator_from(recursion._replace(draws=True, estimated=("members",)))

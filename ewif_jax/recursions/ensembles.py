@@ -12,7 +12,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.model import Model
-from ewif_jax.recursions.innovations import numbers
+from ewif_jax.recursions.innovations import are_finite
 from ewif_jax.recursions.sigma_points import view
 from ewif_jax.types import Gaussian, Measurement, Numbers, Params
 
@@ -27,7 +27,7 @@ class EnsembleState(NamedTuple):
     sight: Array
 
 
-class Look(NamedTuple):
+class EnsembleLook(NamedTuple):
     """What an ensemble makes of a measurement: deviations (m, N) of what its members predict from
     their mean, the noise root G (m, m) with R = G G', the innovation, and mask (m,) of what is
     used: nothing if innovation or covariance are not finite (all_finite () is False then)."""
@@ -71,7 +71,7 @@ def process_noise(
     return noise(key, cholesky.factor(Q).lower, members.shape[1])
 
 
-def carried(model: Model, params: Params, members: Array, t0: Array, t1: Array) -> Array:
+def carried_members(model: Model, params: Params, members: Array, t0: Array, t1: Array) -> Array:
     """The members (n, N) at t1, without process noise."""
 
     def move(x: Array) -> Array:
@@ -80,7 +80,7 @@ def carried(model: Model, params: Params, members: Array, t0: Array, t1: Array) 
     return jax.vmap(move, in_axes=1, out_axes=1)(members)
 
 
-def moved(
+def moved_members(
     model: Model, params: Params, state: EnsembleState, time: Array
 ) -> tuple[EnsembleState, Array]:
     """The state at a time not before its own, and the process noise (n, N) it met.
@@ -90,7 +90,7 @@ def moved(
     """
     key, motion, sight = jax.random.split(state.key, 3)
     met = process_noise(model, params, motion, state.members, state.time, time)
-    members = carried(model, params, state.members, state.time, time) + met
+    members = carried_members(model, params, state.members, state.time, time) + met
     return choose(time > state.time, EnsembleState(time, members, key, sight), state), met
 
 
@@ -105,9 +105,9 @@ def back_key(sight: Array) -> Array:
     return jax.random.fold_in(sight, 2**32 - 1)
 
 
-def look(
+def look_of_ensemble(
     model: Model, params: Params, members: Array, there: Array, measurement: Measurement
-) -> Look:
+) -> EnsembleLook:
     """The measurement as predicted by the members `there` (n, N) at its time; `innovation.cross`
     relates it to `members`."""
     sensor, mask = measurement.sensor, measurement.mask
@@ -130,15 +130,15 @@ def look(
     apart = jnp.max(jnp.abs(deviations), 1) > gaussian.rounding_of(origin)
     deviations = jnp.where(apart[:, None], deviations, 0)
     difference = model.residual(measurement.value, origin + shift, sensor)
-    cov = spread(deviations) + R
-    all_finite = every_offset & numbers(difference, cov, mask)
+    cov = sample_spread(deviations) + R
+    all_finite = every_offset & are_finite(difference, cov, mask)
     mask = mask & all_finite
-    innovation = gaussian.innovate(difference, covariance(deviations, members), cov, mask)
+    innovation = gaussian.innovate(difference, sample_cov(deviations, members), cov, mask)
     root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
-    return Look(jnp.where(all_finite, deviations, 0), root, innovation, mask, all_finite)
+    return EnsembleLook(jnp.where(all_finite, deviations, 0), root, innovation, mask, all_finite)
 
 
-def perturbed(members: Array, looked: Look, key: Array) -> Array:
+def perturbed(members: Array, looked: EnsembleLook, key: Array) -> Array:
     """Each member moved by the gain times its own innovation, nu - (z_i - mean z) - w_i.
 
     Only nu has been wrapped. Wrapped one by one, the innovations of angles far from the prediction
@@ -150,7 +150,7 @@ def perturbed(members: Array, looked: Look, key: Array) -> Array:
     return members + matmul(gaussian.gain(looked.innovation), own)
 
 
-def transformed(members: Array, looked: Look) -> Array:
+def transformed_members(members: Array, looked: EnsembleLook) -> Array:
     r"""The mean moved by the gain times the innovation, the deviations by
     :math:`\bar K = P_{xz} L'^{-1} (L + G)^{-1}` with :math:`P_{zz} = L L',\; R = G G'`."""
     innovation = looked.innovation
@@ -173,21 +173,21 @@ def mean_of(members: Array) -> Array:
     return members[:, 0] + jnp.mean(members - members[:, :1], 1)
 
 
-def covariance(a: Array, b: Array) -> Array:
+def sample_cov(a: Array, b: Array) -> Array:
     """The sample covariance (p, q) of a (p, N) with b (q, N), where a has mean zero."""
     centred = b - mean_of(b)[:, None]
     return jnp.matmul(a, centred.T, precision=jax.lax.Precision.HIGHEST) / (a.shape[1] - 1)
 
 
-def spread(deviations: Array) -> Array:
+def sample_spread(deviations: Array) -> Array:
     """The sample covariance (p, p) of deviations (p, N) from a mean, symmetric to the last bit."""
-    return symmetric.unpack(symmetric.pack(covariance(deviations, deviations)))
+    return symmetric.unpack(symmetric.pack(sample_cov(deviations, deviations)))
 
 
-def moments(members: Array) -> Gaussian:
+def sample_moments(members: Array) -> Gaussian:
     """Sample mean (n,) and covariance (n, n) of members (n, N)."""
     mean = mean_of(members)
-    return Gaussian(mean, spread(members - mean[:, None]))
+    return Gaussian(mean, sample_spread(members - mean[:, None]))
 
 
 def fuse_ensembles(ensembles: Numbers) -> Array:
@@ -228,7 +228,7 @@ def fuse_ensembles(ensembles: Numbers) -> Array:
 def uncorrelated(members: Array, d: Array) -> Array:
     """The members (n, N) less their regression on d (n, N): x_i - P_xd P_dd^-1 d_i."""
     deviations = d - mean_of(d)[:, None]
-    weights = cholesky.solved(spread(deviations), covariance(deviations, members))
+    weights = cholesky.solved(sample_spread(deviations), sample_cov(deviations, members))
     return members - matmul(weights.T, d)
 
 

@@ -74,7 +74,7 @@ def transport(
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
     where = patterns(model)[0]
-    mean, rest = remainders.moved(F, c, state.mean, where)
+    mean, rest = remainders.moved_with_rest(F, c, state.mean, where)
     variances = state.variances if fade is None else fade(state.variances)
     faded = state._replace(time=time, mean=mean, variances=variances)
     back, _ = affine_flow(model, params, time, state.time, dtype)

@@ -42,7 +42,7 @@ def info_of(innovation: gaussian.Innovation, mask: Array, accepted: Array | bool
     )
 
 
-def numbers(difference: Array, cov: Array, mask: Array) -> Array:
+def are_finite(difference: Array, cov: Array, mask: Array) -> Array:
     """Whether an innovation (m,) and its covariance `cov` (m, m) are finite in the components that
     are present, () bool. Its density may be smaller than any float."""
     cov = gaussian.mask_cov(cov, mask)
@@ -61,7 +61,7 @@ def sound(model: Model, cov: Array, seen: Compared) -> tuple[Compared, Array]:
     if model.linear is not None:
         return seen, jnp.asarray(True)
     H = jnp.where(mask[:, None], H, 0)
-    good = numbers(difference, matmul(symmetric.rows(H, cov), H.T) + R, mask)
+    good = are_finite(difference, matmul(symmetric.rows(H, cov), H.T) + R, mask)
     difference, H, R = (jnp.where(good, x, 0) for x in (difference, H, R))
     return Compared(difference, H, R, mask & good), good
 

@@ -12,7 +12,7 @@ from ewif_jax.models import Model
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
-from ewif_jax.recursions.weighing import Seen
+from ewif_jax.recursions.weighing import SeenByCloud
 from ewif_jax.types import Measurement, Params, State
 
 BLOCK = 256
@@ -49,14 +49,16 @@ def lines(
     Deviations: the printed recursion does not say that particles are weighed by y(m).
     """
     key, first, second = jax.random.split(key, 3)
-    drawn = start.mean[:, None] + form.noise(first, symmetric.unpack(start.cov), count)
-    _, there = form.moved(model, params, drawn, second, start.time, tau)
+    drawn = start.mean[:, None] + form.process_draws(first, symmetric.unpack(start.cov), count)
+    _, there = form.moved_particles(model, params, drawn, second, start.time, tau)
     log_weights = jnp.full(count, -jnp.log(jnp.asarray(count, there.dtype)), there.dtype)
 
     def follow(state: Lines, measurement: Measurement) -> Lines:
         key, first, second = jax.random.split(state.key, 3)
-        _, ahead = form.moved(model, params, state.particles, first, state.time, measurement.time)
-        seen = weighing.look(model, params, ahead, state.log_weights, measurement)
+        _, ahead = form.moved_particles(
+            model, params, state.particles, first, state.time, measurement.time
+        )
+        seen = weighing.look_of_cloud(model, params, ahead, state.log_weights, measurement)
         moved = Lines(measurement.time, ahead, state.fixed, state.log_weights, key)
         log_weights, _ = weighing.weigh(moved, seen, measurement)
         (ahead, fixed), log_weights = form.refreshed(
@@ -78,7 +80,7 @@ def lines(
 
 def look_back(
     model: Model, params: Params, last: Lines, now: Array, state: State, measurement: Measurement
-) -> Seen:
+) -> SeenByCloud:
     r"""A late measurement as it is seen by particles now (n, N), through the lines.
 
     .. math::
@@ -92,7 +94,7 @@ def look_back(
     """
     ahead = form.transported(model, params, last.particles, last.time, now)
     f = cholesky.factor(jnp.asarray(model.process_cov(params, last.time, now), ahead.dtype))
-    found = weighing.compared(model, params, last.fixed, measurement)
+    found = weighing.compared_cloud(model, params, last.fixed, measurement)
     line_density = weighing.log_density(found, measurement.mask)
     line_weights = weighing.shares(last.log_weights, found.numbers)
     origin = weighing.stand_in(model, params, found.numbers, last.fixed, line_weights, measurement)
@@ -123,4 +125,4 @@ def look_back(
     shift, square = (matmul(x, w)[:, 0] for x in (sums[2 : 2 + m], sums[2 + m :]))
     innovation = weighing.innovation_of(model, origin, shift, found.numbers, measurement)
     cov = found.R + square.reshape(m, m) - shift[:, None] * shift[None]
-    return Seen(log_density, innovation, weighing.judged(cov, found.numbers))
+    return SeenByCloud(log_density, innovation, weighing.judged_cov(cov, found.numbers))

@@ -56,16 +56,16 @@ def collapse_factor(collapse: float | None) -> float | None:
     return None if collapse is None else float(checks.at_least("collapse", collapse, 1.0))
 
 
-def drawn(kind: Cloud, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
+def drawn_particles(kind: Cloud, prior: Gaussian, t0: Array, key: Array) -> ParticleState:
     """Equally weighted particles drawn from the prior, whose covariance may be singular."""
     N, dtype = kind.particles, t0.dtype
     key, ours = jax.random.split(key)
-    particles = prior.mean[:, None] + noise(ours, prior.cov, N)
+    particles = prior.mean[:, None] + process_draws(ours, prior.cov, N)
     log_weights = jnp.full(N, -jnp.log(jnp.asarray(N, dtype)), dtype)
     return ParticleState(t0, particles, log_weights, key)
 
 
-def noise(key: Array, cov: Array, count: int) -> Array:
+def process_draws(key: Array, cov: Array, count: int) -> Array:
     """(n, count) draws from N(0, cov), cov (n, n) singular or not."""
     # The factor skips pivots that are zero, so that a singular covariance (a constant velocity
     # driven by one acceleration) needs no small noise added to it.
@@ -73,14 +73,14 @@ def noise(key: Array, cov: Array, count: int) -> Array:
     return matmul(cholesky.factor(cov).lower, normals)
 
 
-def moved(
+def moved_particles(
     model: Model, params: Params, particles: Array, key: Array, t0: Array, t1: Array
 ) -> tuple[Array, Array]:
     """Particles (n, N) at t1 >= t0 without their process noise, and with it."""
     still = transported(model, params, particles, t0, t1)
     Q = jnp.asarray(model.process_cov(params, t0, t1), particles.dtype)
     checks.shape("Q", Q, (particles.shape[0],) * 2)
-    return still, still + noise(key, Q, particles.shape[1])
+    return still, still + process_draws(key, Q, particles.shape[1])
 
 
 def transported(model: Model, params: Params, particles: Array, t0: Array, t1: Array) -> Array:
@@ -118,7 +118,7 @@ def step_ahead(
     # noise, and the estimate is made with the weights before resampling, which has less variance.
     key, first, second = jax.random.split(state.key, 3)
     state, along = renewed(kind, first, state, along)
-    _, particles = moved(kind.model, params, state.particles, second, state.time, time)
+    _, particles = moved_particles(kind.model, params, state.particles, second, state.time, time)
     return state._replace(time=time, particles=particles, key=key), along
 
 
@@ -179,7 +179,7 @@ def resampled(
     return jax.tree.map(take, cloud), equal
 
 
-def moments(x: Array, weights: Array) -> tuple[Array, Array]:
+def weighted_moments(x: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of x (n, N) under weights (N,) that sum to one."""
     # About one particle: rounded weights do not sum to one, which far from the origin would count.
     # Their sum has a derivative (see `resampled`), which goes with the whole of x.
@@ -191,7 +191,7 @@ def moments(x: Array, weights: Array) -> tuple[Array, Array]:
     return start + shift, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
 
 
-def estimate(params: Params, state: State) -> Gaussian:
+def estimate_of_cloud(params: Params, state: State) -> Gaussian:
     """The `estimate` of a recursion whose state begins with the fields of `ParticleState`."""
     del params
     return summary(state)
@@ -199,4 +199,4 @@ def estimate(params: Params, state: State) -> Gaussian:
 
 def summary(state: State) -> Gaussian:
     """Weighted mean (n,) and covariance (n, n) of the particles."""
-    return Gaussian(*moments(state.particles, jnp.exp(state.log_weights)))
+    return Gaussian(*weighted_moments(state.particles, jnp.exp(state.log_weights)))

@@ -52,7 +52,7 @@ def standstill(n: int, dtype: DTypeLike) -> Passage:
     return Passage(eye, jnp.zeros(n, dtype), eye, jnp.ones((), dtype))
 
 
-def then(first: Passage, second: Passage) -> Passage:
+def both_passages(first: Passage, second: Passage) -> Passage:
     """Both, one after the other."""
     return Passage(
         matmul(second.ahead, first.ahead),
@@ -62,7 +62,7 @@ def then(first: Passage, second: Passage) -> Passage:
     )
 
 
-def carried(state: InformationState, over: Passage, to: Array) -> InformationState:
+def carried_over(state: InformationState, over: Passage, to: Array) -> InformationState:
     """The state after the passage, at time `to`."""
     mean = matvec(over.ahead, state.mean) + over.offset
     faded = state._replace(time=to, variances=grown(state.variances, over.growth))

@@ -15,7 +15,7 @@ from ewif_jax.models.linearise import patterns, predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
-from ewif_jax.recursions.innovations import Compared, info_of, numbers, updated
+from ewif_jax.recursions.innovations import Compared, are_finite, info_of, updated
 from ewif_jax.types import DTypeLike, Info, Measurement, Params
 
 ROUNDING = 1e-4
@@ -30,14 +30,14 @@ class SigmaPoints(NamedTuple):
     ut_kappa: Any = 0.0
 
 
-class Transform(NamedTuple):
+class PointWeights(NamedTuple):
     """c = n + lambda, and the covariance weight of the central point."""
 
     scale: Array
     centre: Array
 
 
-def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> Transform:
+def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> PointWeights:
     """The weights for n states; refuses settings that `dtype` cannot carry."""
     ut_alpha, ut_beta, ut_kappa = (resolve(x, params) for x in points)
     checks.positive("ut_alpha", ut_alpha)
@@ -57,7 +57,7 @@ def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> 
             ut_alpha,
         )
     scale = jnp.asarray(spread, dtype)
-    return Transform(scale, jnp.asarray(2 - n / spread - ut_alpha**2 + ut_beta, dtype))
+    return PointWeights(scale, jnp.asarray(2 - n / spread - ut_alpha**2 + ut_beta, dtype))
 
 
 def view(
@@ -136,10 +136,10 @@ def measure_around(
         H = unseen(sigma_points.slope_of(line, root), still)
         return updated(model, mean, cov, Compared(difference, H, R, mask))
     slope = jnp.where((mask & is_spread)[:, None], line.slope, 0)
-    good = numbers(difference, matmul(slope, slope.T) + R, mask)
+    good = are_finite(difference, matmul(slope, slope.T) + R, mask)
     difference, slope, R = (jnp.where(good, x, 0) for x in (difference, slope, R))
     mask = mask & good
-    mean, cov, innovation = sigma_points.update(mean, lower, difference, slope, R, mask)
+    mean, cov, innovation = sigma_points.update_by_points(mean, lower, difference, slope, R, mask)
     return mean, cov, info_of(innovation, mask, good)
 
 

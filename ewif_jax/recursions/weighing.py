@@ -13,11 +13,11 @@ from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.resampling import effective_sample_size
 from ewif_jax.models import Model
 from ewif_jax.models.sensor_range import check_sensor
-from ewif_jax.recursions.particles import moments
+from ewif_jax.recursions.particles import weighted_moments
 from ewif_jax.types import Info, Measurement, Params, State, Status
 
 
-class Seen(NamedTuple):
+class SeenByCloud(NamedTuple):
     """A measurement as the particles see it: log_density (N,) of it given each of them (-inf where
     it is not a number), innovation (m,) and innovation_cov (m, m) given all of them: 0 and the
     identity where none of them makes a number of it."""
@@ -27,7 +27,7 @@ class Seen(NamedTuple):
     innovation_cov: Array
 
 
-class Compared(NamedTuple):
+class ComparedCloud(NamedTuple):
     """A measurement beside what each particle predicts: predicted (m, N), difference (m, N), 0
     where it is absent or not a number, numbers (N,): where it and its square are numbers, R (m, m)
     with unit variance where it is absent, and its factor."""
@@ -44,23 +44,23 @@ def is_late(state: State, measurement: Measurement) -> Array:
     return (measurement.time < state.time) & jnp.any(measurement.mask)
 
 
-def look(
+def look_of_cloud(
     model: Model, params: Params, particles: Array, log_weights: Array, measurement: Measurement
-) -> Seen:
+) -> SeenByCloud:
     """The measurement as it is seen by particles (n, N) at its time.
 
     A component without noise (singular R) cannot weigh particles: no density is a number then.
     """
-    found = compared(model, params, particles, measurement)
+    found = compared_cloud(model, params, particles, measurement)
     density = log_density(found, measurement.mask)
-    innovation, spread = averaged(
+    innovation, spread = averaged_innovation(
         model, params, particles, found.predicted, found.numbers, log_weights, measurement
     )
     cov = found.R + spread
-    return Seen(density, innovation, judged(cov, found.numbers))
+    return SeenByCloud(density, innovation, judged_cov(cov, found.numbers))
 
 
-def averaged(
+def averaged_innovation(
     model: Model,
     params: Params,
     particles: Array,
@@ -74,11 +74,13 @@ def averaged(
     weights = shares(log_weights, numbers)
     origin = stand_in(model, params, numbers, particles, weights, measurement)
     offsets = about(model, origin, predicted, numbers, measurement)
-    shift, spread = moments(offsets, weights)
+    shift, spread = weighted_moments(offsets, weights)
     return innovation_of(model, origin, shift, numbers, measurement), spread
 
 
-def compared(model: Model, params: Params, particles: Array, measurement: Measurement) -> Compared:
+def compared_cloud(
+    model: Model, params: Params, particles: Array, measurement: Measurement
+) -> ComparedCloud:
     """The measurement beside what particles (n, N) at its time predict."""
     time, value, sensor, mask = measurement
     check_sensor(model, params, particles[:, 0], sensor, time)
@@ -96,10 +98,10 @@ def compared(model: Model, params: Params, particles: Array, measurement: Measur
     numbers = jnp.all(jnp.isfinite(jnp.square(difference)), 0)
     R = gaussian.mask_cov(R, mask)
     difference = jnp.where(numbers, difference, 0)
-    return Compared(predicted, difference, numbers, R, cholesky.factor(R))
+    return ComparedCloud(predicted, difference, numbers, R, cholesky.factor(R))
 
 
-def log_density(found: Compared, mask: Array) -> Array:
+def log_density(found: ComparedCloud, mask: Array) -> Array:
     """log p(z | x) (N,), -inf where it is not a number."""
     f = found.factor
     white = cholesky.forward(f, found.difference)
@@ -156,13 +158,13 @@ def innovation_of(
     return jnp.where(measurement.mask & jnp.any(numbers), difference, 0)
 
 
-def judged(cov: Array, numbers: Array) -> Array:
+def judged_cov(cov: Array, numbers: Array) -> Array:
     """The innovation's covariance (m, m), the identity where no particle makes a number of it."""
     return jnp.where(jnp.any(numbers), cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
 
 
 def weigh(
-    state: State, seen: Seen, measurement: Measurement, collapse: float | None = None
+    state: State, seen: SeenByCloud, measurement: Measurement, collapse: float | None = None
 ) -> tuple[Array, Info]:
     r"""Log weights :math:`\log w_i + \log p(z | x_i)`, normalised (N,), and the `Info`.
 

@@ -27,7 +27,7 @@ MOST_LOOKS = 6
 """Of how many parameters."""
 
 
-class Seen(NamedTuple):
+class SeenPoint(NamedTuple):
     """A point (n,), its value and gradient (n,)."""
 
     point: np.ndarray
@@ -72,7 +72,7 @@ def quasi_newton(
 
 def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked:
     value, gradient = yield start
-    best = Seen(start, value, gradient)
+    best = SeenPoint(start, value, gradient)
     ends = np.zeros(len(start), int)
     if not best.is_finite:
         return Ended("not finite", ends)
@@ -89,8 +89,8 @@ def _in_units(start: np.ndarray, has_ends: np.ndarray, rounding: float) -> Asked
 
 
 def _descent_result(
-    seen: Seen, rounding: float
-) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[Seen, str, bool]]:
+    seen: SeenPoint, rounding: float
+) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[SeenPoint, str, bool]]:
     """The end of one descent, why it ended, and whether a step was refused as not finite."""
     n, refused, fresh, earlier = len(seen.point), False, 0, seen.value
     curvature, radius = np.eye(n) * np.linalg.norm(seen.gradient), 1.0
@@ -111,7 +111,7 @@ def _descent_result(
             fresh += 1
             continue
         value, gradient = yield seen.point + step
-        tried = Seen(seen.point + step, value, gradient)
+        tried = SeenPoint(seen.point + step, value, gradient)
         length = float(np.linalg.norm(step))
         if not tried.is_finite:
             refused, radius = True, length / 4
@@ -128,8 +128,8 @@ def _descent_result(
 
 
 def _looked_around(
-    seen: Seen, way: np.ndarray, has_ends: np.ndarray, tolerance: float
-) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[Seen | None, np.ndarray]]:
+    seen: SeenPoint, way: np.ndarray, has_ends: np.ndarray, tolerance: float
+) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[SeenPoint | None, np.ndarray]]:
     """The lowest point around, if it is lower, and which numbers can move on in one direction for
     nothing (in both: that of `way` (n,), by which it came)."""
     ends = np.zeros(len(seen.point), int)
@@ -145,7 +145,7 @@ def _looked_around(
                 there = seen.point.copy()
                 there[k] += sign * distance
                 value, gradient = yield there
-                tried = Seen(there, value, gradient)
+                tried = SeenPoint(there, value, gradient)
                 flat &= abs(value - seen.value) <= 1e-4 * abs(seen.value)
                 below = seen.value - 10 * tolerance if lowest is None else lowest.value
                 if tried.is_finite and value < below:

@@ -68,7 +68,7 @@ def test_the_expected_errors_are_those_of_the_published_equations(table, motion,
     start = {"t0": 0.0, "prior_cov": np.eye(n)}
     H, R = np.eye(1, n), np.eye(1)
     for lag in late_loss.LAGS:
-        times = late_loss.arrivals(lag)
+        times = late_loss.arrival_pairs(lag)
         steps = times.size - 1
 
         def last(values, times=times, steps=steps):

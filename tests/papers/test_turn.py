@@ -9,7 +9,7 @@ from ewif_jax.analysis.storage import storage
 from ewif_jax.study.papers.turn import runs as runs_of
 from ewif_jax.study.papers.turn import study
 from ewif_jax.study.shared.claims import ratio
-from ewif_jax.study.shared.late import mean_of, rmse
+from ewif_jax.study.shared.late import mean_of, rmse_of
 
 pytestmark = pytest.mark.slow  # tests/study/test_turn_study.py runs every method, smaller
 RUNS = 24
@@ -29,16 +29,16 @@ SMOOTHED = (runs_of.EKS, runs_of.UKS, runs_of.PS)
 
 def computed():
     """What every method finds, and the bounds."""
-    batches = runs_of.simulated(jax.random.key(7), RUNS)
+    batches = runs_of.turn_worlds(jax.random.key(7), RUNS)
     own = jax.random.split(jax.random.key(8), RUNS)
 
     def followed(name, method):
         runs = FEW.get(name, RUNS)
         some = jax.tree.map(lambda x: x[:runs], batches[method.in_order])
-        return runs_of.followed(method, some, own[:runs])
+        return runs_of.followed_turns(method, some, own[:runs])
 
-    found = {name: followed(name, method) for name, method in runs_of.methods(10_000).items()}
-    return found, runs_of.bounds(batches[False])
+    found = {name: followed(name, method) for name, method in runs_of.turn_methods(10_000).items()}
+    return found, runs_of.turn_bounds(batches[False])
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,9 @@ def bound(results):
 
 @pytest.fixture(scope="module")
 def held():
-    return {name: storage(x.estimator, 5).numbers for name, x in runs_of.methods(10_000).items()}
+    return {
+        name: storage(x.estimator, 5).numbers for name, x in runs_of.turn_methods(10_000).items()
+    }
 
 
 def off(found, name, runs=RUNS):
@@ -68,7 +70,7 @@ def off(found, name, runs=RUNS):
 @pytest.mark.parametrize("name", REFERENCE)
 def test_errors_are_those_of_an_independent_computation(found, name):
     for kind, (value, error) in zip(("position", "velocity"), REFERENCE[name], strict=True):
-        ours = rmse(study.settled(found[name], kind))
+        ours = rmse_of(study.settled(found[name], kind))
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, error)
 
 

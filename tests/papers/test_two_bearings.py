@@ -9,7 +9,7 @@ from ewif_jax.study.papers.two_bearings import runs as runs_of
 from ewif_jax.study.papers.two_bearings import study
 from ewif_jax.study.papers.two_bearings.claims import FIVE, NONE, TEN
 from ewif_jax.study.shared.claims import ratio, share
-from ewif_jax.study.shared.late import mean_of, rmse
+from ewif_jax.study.shared.late import mean_of, rmse_of
 
 REFERENCE = {
     runs_of.EXACT: ((3.57, 0.21), (6.67, 0.26), (10.85, 0.33)),
@@ -27,10 +27,15 @@ particles"""
 
 def computed(left_out):
     """The times of a world (D, T), what every method finds in it, and its bounds."""
-    world = runs_of.simulated(jax.random.key(2), 60)
-    every = {name: x for name, x in runs_of.methods(10_000).items() if name not in left_out}
-    found = {name: runs_of.followed(one, world, jax.random.key(5)) for name, one in every.items()}
-    return world.times, found, runs_of.bounds(world)
+    world = runs_of.bearings_world(jax.random.key(2), 60)
+    every = {
+        name: x for name, x in runs_of.bearings_methods(10_000).items() if name not in left_out
+    }
+    found = {
+        name: runs_of.followed_bearings(one, world, jax.random.key(5))
+        for name, one in every.items()
+    }
+    return world.times, found, runs_of.bearings_bounds(world)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +69,7 @@ def off(times, found):
 @pytest.mark.parametrize("name", REFERENCE)
 def test_errors_are_those_of_an_independent_computation(off, name):
     for delay, (value, error) in enumerate(REFERENCE[name]):
-        ours = rmse(off[name][delay])
+        ours = rmse_of(off[name][delay])
         assert abs(ours.value - value) < 4 * np.hypot(ours.error, error)
 
 

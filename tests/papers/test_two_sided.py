@@ -14,7 +14,7 @@ from ewif_jax.study.shared.late import paired
 @pytest.fixture(scope="module")
 def on_the_sine():
     batch = simulate_batch(sine(), jax.random.split(jax.random.key(0), 300))
-    return two_sided.compared(sine_model(), np.asarray([0.5, 0.8]), batch, steps=5)
+    return two_sided.compared_means(sine_model(), np.asarray([0.5, 0.8]), batch, steps=5)
 
 
 @pytest.fixture(scope="module")

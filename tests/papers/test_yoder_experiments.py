@@ -10,7 +10,7 @@ import ewif_jax as ej
 from ewif_jax.scenarios import arrowhead, random_walk, random_walk_model
 from ewif_jax.study.papers.arrowhead import study as heads
 from ewif_jax.study.papers.random_walk import study as walks
-from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse, rmses, sweep
+from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse_of, rmses_of, sweep
 
 WALKS = {
     "4a": (6.04, 0.04, 4.14, 0.13, 4.01, 0.12, 3.97, 0.12),
@@ -19,7 +19,7 @@ WALKS = {
 }
 """independently computed: RMSE and standard error of drop, selective at T_d, Al1, exact (4a, drop:
 of 2,000 runs; the rest of 40)"""
-FASTEST = walks.Case("5d", 500.0, 0.1)
+FASTEST = walks.WalkCase("5d", 500.0, 0.1)
 CASES = (*walks.CASES, FASTEST)
 RECOVERED = {"4a": 0.92, "4b": 0.87, "4c": 0.71}
 HEAD = {0: 55.28, 2: 53.40, 3: 52.41, 4: 51.82, heads.stale(): 51.34, 8: 51.33, 10: 51.40,
@@ -39,7 +39,7 @@ def walked():
 
     batch = jax.device_get(jax.jit(jax.vmap(one))(q, delay, keys))
     found = sweep(
-        walks.selective_al1(history_needed(batch.measurements)),
+        walks.walk_al1(history_needed(batch.measurements)),
         {"cutoff": walks.MULTIPLES[:, None] * limits, "q": np.tile(q, (walks.MULTIPLES.size, 1))},
         batch,
         prior=random_walk().prior,
@@ -66,7 +66,7 @@ def head():
     scenario = arrowhead(steps=3000)
     batch = ej.simulate_batch(scenario, jax.random.split(jax.random.key(5), 12))
     found = sweep(
-        heads.selective_al1(history_needed(batch.measurements)),
+        heads.arrowhead_al1(history_needed(batch.measurements)),
         {"cutoff": np.asarray(list(HEAD))},
         batch,
         prior=scenario.prior,
@@ -82,7 +82,7 @@ def test_random_walk_errors_are_those_of_an_independent_computation(walk, number
     rows = squared[0], squared[walks.AT_CUTOFF], squared[-1], exact
     reference = np.reshape(WALKS[name], (4, 2))
     for row, (value, error) in zip(rows, reference, strict=True):
-        found = rmse(row[number])
+        found = rmse_of(row[number])
         assert abs(found.value - value) < 4 * np.hypot(found.error, error)
 
 
@@ -91,7 +91,7 @@ def test_exact_is_not_worse_than_al1_nor_al1_than_dropping_on_the_right_model(wa
     for number in range(len(WALKS)):
         better = paired(squared[-1, number], squared[0, number])
         assert better.value < -4 * better.error
-        assert rmse(exact[number]).value < rmse(squared[-1, number]).value * 1.01
+        assert rmse_of(exact[number]).value < rmse_of(squared[-1, number]).value * 1.01
 
 
 def test_what_dropping_costs_on_the_slowest_walk():
@@ -101,7 +101,7 @@ def test_what_dropping_costs_on_the_slowest_walk():
     batch = ej.simulate_batch(scenario, jax.random.split(jax.random.key(10), runs))
     filtered = ej.drop_late(ej.kalman(random_walk_model(case.sigma**2, walks.VARIANCE)))
     squared = sweep(filtered, {"none": np.zeros(1)}, batch, prior=scenario.prior, t0=0.0)
-    found = rmse(squared["squared_error"][0])
+    found = rmse_of(squared["squared_error"][0])
     assert found.error < 0.13
     assert abs(found.value - 6.04) < 3.5 * np.hypot(found.error, 0.04)
 
@@ -124,14 +124,14 @@ def test_the_cutoff_recovers_most_of_the_gain_over_three_decades(walk):
     print(
         walks.recovered(fastest),
         walks.reach(walks.recovered(fastest), 0.95),
-        rmse(fastest[0]),
+        rmse_of(fastest[0]),
         better,
     )
 
 
 @pytest.mark.parametrize("cutoff", list(HEAD))
 def test_arrowhead_errors_are_those_of_an_independent_computation(head, cutoff):
-    found = rmse(head[cutoff])
+    found = rmse_of(head[cutoff])
     assert abs(found.value - HEAD[cutoff]) < 4 * np.hypot(found.error, 0.13)
 
 
@@ -146,6 +146,6 @@ def test_old_measurements_do_harm_on_the_arrowhead(head):
 
 
 def test_the_best_cutoff_on_the_arrowhead_is_near_the_theoretical_one(head):
-    values, _ = rmses(np.stack(list(head.values())))
+    values, _ = rmses_of(np.stack(list(head.values())))
     best = list(head)[int(np.argmin(values))]
     assert heads.stale() <= best <= 10

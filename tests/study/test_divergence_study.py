@@ -59,7 +59,7 @@ def test_the_chosen_settings_are_the_best_settled_ones():
     """Under the white push, against a fine search over settled errors."""
     late = np.array([400.0])
     for remedy in REMEDIES[1:]:
-        best = study.chosen(remedy, 0.001)
+        best = study.chosen_setting(remedy, 0.001)
         mse = [
             float(divergence_curve(remedy, "white", late, eps=0.3, setting=scale * best)[0])
             for scale in (0.9, 1.0, 1.1)

@@ -11,7 +11,7 @@ import pytest
 
 from ewif_jax.lab.timing import timed
 from ewif_jax.study import cli
-from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown
+from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown_number
 from ewif_jax.study.shared.folder import Folder
 
 
@@ -84,10 +84,10 @@ def test_compile_time_is_told_from_run_time():
 
 
 def test_table_cells():
-    assert shown(Measured(0.30072, 0.00051)) == "0.30072 ± 0.00051"
-    assert shown(Measured(123.456, 12.0)) == "123 ± 12"
-    assert shown(Measured(1.5, float("nan"))) == "1.5"
-    assert shown(None) == ""
+    assert shown_number(Measured(0.30072, 0.00051)) == "0.30072 ± 0.00051"
+    assert shown_number(Measured(123.456, 12.0)) == "123 ± 12"
+    assert shown_number(Measured(1.5, float("nan"))) == "1.5"
+    assert shown_number(None) == ""
 
 
 def test_tables_are_saved_with_errors(tmp_path):

@@ -23,7 +23,7 @@ from ewif_jax.study.papers.arbitrary_target import study as arbitrary
 from ewif_jax.study.papers.gains import study as gains
 from ewif_jax.study.papers.tuning_under_delay import study as tuning
 from ewif_jax.study.shared.experiment import Experiment, Options
-from ewif_jax.study.shared.late import history_needed, mean_of, paired, rmse, sweep
+from ewif_jax.study.shared.late import history_needed, mean_of, paired, rmse_of, sweep
 from ewif_jax.types import Measurement
 
 FILES = {
@@ -59,14 +59,14 @@ def test_history_needed_counts_the_update_times_behind():
 
 def test_errors_of_runs():
     squared, other = np.asarray([4.0, 9.0, 16.0]), np.asarray([1.0, 4.0, 9.0])
-    assert rmse(squared).value == pytest.approx(np.sqrt(29 / 3))
+    assert rmse_of(squared).value == pytest.approx(np.sqrt(29 / 3))
     assert paired(squared, other) == pytest.approx((1.0, 0.0))
     assert mean_of(np.asarray([1.0, 3.0])) == pytest.approx((2.0, 1.0))
 
 
 def test_regular_gains_are_the_closed_form():
     """With equal intervals the gains that are followed are those of eq. (5)."""
-    for case in gains.cases():
+    for case in gains.gain_cases():
         n, steps, lag = case.H.shape[1], 300, 8
         F, Q = (np.broadcast_to(x(case.interval), (steps, n, n)) for x in (case.F, case.Q))
         found = gain_history(F, case.H, Q, np.eye(1), np.eye(n), lag)
@@ -77,7 +77,7 @@ def test_regular_gains_are_the_closed_form():
 def test_old_gains_at_poisson_times():
     """Fig. 2: fresh 0.563 for 0.618 in theory, and 8 back half a unit of logarithm more; Fig. 1,
     where little happens in an interval: within 0.03 in the logarithm."""
-    low, typical, _ = gains.cases()
+    low, typical, _ = gains.gain_cases()
     keys = jax.random.split(jax.random.key(0), 400)
     ages, found = gains.actual(typical, keys)
     theory = gains.closed_form(typical, ages)
@@ -121,14 +121,14 @@ def test_what_the_extended_filter_gains_up_to_5_seconds():
     dropped, five, everything = sweep(method, limits, batch, prior=scenario.prior, t0=0.0)[
         "squared_error"
     ]
-    found = rmse(everything)
+    found = rmse_of(everything)
     assert abs(found.value - 15.79) < 4 * np.hypot(found.error, 0.04)
     assert found.error < 0.3
     for better, worse in ((five, dropped), (everything, five)):
         difference = paired(better, worse)
         assert difference.value < -4 * difference.error
-    least, most = found.value, rmse(dropped).value
-    assert 0.05 < (rmse(five).value - least) / (most - least) < 0.3
+    least, most = found.value, rmse_of(dropped).value
+    assert 0.05 < (rmse_of(five).value - least) / (most - least) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_what_the_extended_filter_gains_up_to_5_seconds():
 )
 def test_what_is_learned_through_late_measurements_is_better_on_other_runs(number, tmp_path):
     """A short descent from the published setting; judged on runs that it has not seen."""
-    one = tuning.methods()[number]._replace(grid=np.zeros(0))
+    one = tuning.delay_methods()[number]._replace(grid=np.zeros(0))
     scenario = arrowhead(r=tuning.VARIANCE, steps=600)
     seen, batch = (simulate_batch(scenario, jax.random.split(jax.random.key(k), 8)) for k in (3, 4))
     lag = max(history_needed(x.measurements) for x in (seen, batch))

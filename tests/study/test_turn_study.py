@@ -16,18 +16,18 @@ FILES = {
     "about.json", "claims.csv", "fig3_position.png", "fig4_velocity.png", "pareto.png",
     "storage.csv", "tracks.png", "turn.csv", "turn.nc",
 }  # fmt: skip
-METHODS = tuple(runs_of.methods(10))
+METHODS = tuple(runs_of.turn_methods(10))
 
 
 def light(particles=10):
     """Every name of the study, with filters that compile fast."""
     del particles
     model = turn_model()
-    plain = runs_of.Method(ej.extended(model))
+    plain = runs_of.TurnMethod(ej.extended(model))
     known = {
-        runs_of.EKS: runs_of.Method(ej.al1(model, runs_of.LAG)),
-        runs_of.ORD: runs_of.Method(ej.extended(model), in_order=True),
-        runs_of.PS: runs_of.Method(
+        runs_of.EKS: runs_of.TurnMethod(ej.al1(model, runs_of.LAG)),
+        runs_of.ORD: runs_of.TurnMethod(ej.extended(model), in_order=True),
+        runs_of.PS: runs_of.TurnMethod(
             ej.replay(ej.extended(model), runs_of.BUFFER, width=2), share=0.5
         ),
     }
@@ -60,5 +60,5 @@ def test_the_sigma_points_are_the_printed_ones_where_they_can_be():
     with jax.enable_x64(False):
         assert "cubature" in runs_of.sigma_points_note()
         prior = turn_scenario().prior
-        state = runs_of.methods(10)[runs_of.UKF].estimator.init(None, prior, 0.0)
+        state = runs_of.turn_methods(10)[runs_of.UKF].estimator.init(None, prior, 0.0)
         assert state.mean.dtype == "float32"

@@ -27,11 +27,11 @@ TABLES = {"two_bearings.csv", "claims.csv", "storage.csv"}
 def light(particles=10):
     """Every name of the study, with filters that compile fast."""
     del particles
-    plain = runs_of.Method(ej.extended(two_bearings_model()), "validity")
+    plain = runs_of.BearingsMethod(ej.extended(two_bearings_model()), "validity")
     return dict.fromkeys(METHODS, plain)
 
 
-METHODS = tuple(runs_of.methods(10))
+METHODS = tuple(runs_of.bearings_methods(10))
 
 
 def test_study_runs_end_to_end(tmp_path, monkeypatch):
@@ -56,9 +56,9 @@ def test_study_runs_end_to_end(tmp_path, monkeypatch):
 
 def test_padding_the_shorter_delays_changes_nothing():
     key = jax.random.key(3)
-    world = runs_of.simulated(key, 2)
-    method = runs_of.methods(10)[runs_of.EKF]
-    found = runs_of.followed(method, world, jax.random.key(0))
+    world = runs_of.bearings_world(key, 2)
+    method = runs_of.bearings_methods(10)[runs_of.EKF]
+    found = runs_of.followed_bearings(method, world, jax.random.key(0))
     scenario = two_bearings(10.0)
     one = jax.jit(scenario.simulate)(jax.random.split(key, 2)[1])
     trace = ej.run(

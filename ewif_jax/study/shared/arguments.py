@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _common_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("common options")
-    group.add_argument("--seed", type=seed, default=0, help="of the random numbers (0)")
+    group.add_argument("--seed", type=seed_argument, default=0, help="of the random numbers (0)")
     group.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
     group.add_argument(
         "--overwrite", action="store_true", help="replace earlier results instead of keeping them"
@@ -42,9 +42,11 @@ def _study_options(parser: argparse.ArgumentParser) -> None:
     lines = [f"  {study.name:20}{study.help}" for study in STUDIES]
     parser.description = "\n".join(["Studies:", *lines, f"  {'all':20}all of them"])
     parser.add_argument("name", choices=[*(s.name for s in STUDIES), "all"], metavar="NAME")
-    parser.add_argument("--runs", type=whole(2), help="simulated runs (the study's own choice)")
+    parser.add_argument(
+        "--runs", type=whole_argument(2), help="simulated runs (the study's own choice)"
+    )
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
-    parser.add_argument("--chunk", type=whole(1), help="runs in memory at once (1024)")
+    parser.add_argument("--chunk", type=whole_argument(1), help="runs in memory at once (1024)")
     _common_options(parser)
 
 
@@ -65,8 +67,10 @@ def _track_options(parser: argparse.ArgumentParser) -> None:
     columns.add_argument("--track", metavar="COL", help="which object")
     columns.add_argument("--sensor", metavar="COL", help="which sensor")
     where = columns.add_mutually_exclusive_group()
-    where.add_argument("--values", metavar="X,Y", type=names, help="position, in metres")
-    where.add_argument("--latlon", metavar="LAT,LON", type=names, help="position, in degrees")
+    where.add_argument("--values", metavar="X,Y", type=names_argument, help="position, in metres")
+    where.add_argument(
+        "--latlon", metavar="LAT,LON", type=names_argument, help="position, in degrees"
+    )
     columns.add_argument("--date", metavar="COL", help="of the days, where --time has times of day")
     columns.add_argument("--decimal", choices=(".", ","), help="mark of decimals (what it shows)")
     columns.add_argument(
@@ -76,23 +80,28 @@ def _track_options(parser: argparse.ArgumentParser) -> None:
         "--drop-stale", action="store_true", help="drop rows that repeat the last value of a track"
     )
     columns.add_argument(
-        "--min-points", type=whole(1), default=1, help="leave out shorter tracks (1)"
+        "--min-points", type=whole_argument(1), default=1, help="leave out shorter tracks (1)"
     )
     method = parser.add_argument_group("method")
     method.add_argument("--model", choices=MODELS, default="constant-velocity")
     method.add_argument("--estimator", choices=ESTIMATORS, default="ewif")
     method.add_argument(
         "--noise",
-        type=noise,
+        type=noise_argument,
         default={"": 1.0},
         metavar="M",
         help="measurement standard deviation in metres: 30, or radar=30,gps=5 (1)",
     )
     method.add_argument("--tau", type=positive, help="decay of the ewif, seconds")
     method.add_argument("--q", type=positive, help="process noise (m^2/s, m^2/s^3, m^2/s^5)")
-    method.add_argument("--fading", type=above(1), help="Anderson's alpha per step, above 1")
     method.add_argument(
-        "--lag", type=whole(1), default=4, help="past times al1, or measurements asd, keeps (4)"
+        "--fading", type=above_argument(1), help="Anderson's alpha per step, above 1"
+    )
+    method.add_argument(
+        "--lag",
+        type=whole_argument(1),
+        default=4,
+        help="past times al1, or measurements asd, keeps (4)",
     )
     tuning = parser.add_argument_group("tuning")
     tuning.add_argument("--tune", action="store_true", help="tau, q or fading, by gradient")
@@ -103,14 +112,16 @@ def _track_options(parser: argparse.ArgumentParser) -> None:
         help="of the prediction errors: their median, mean length (robust), "
         "root mean square, or the likelihood",
     )
-    tuning.add_argument("--steps", type=whole(1), default=200, help="evaluations, at most (200)")
     tuning.add_argument(
-        "--warm-up", type=whole(0), default=5, help="first rows of a track not scored (5)"
+        "--steps", type=whole_argument(1), default=200, help="evaluations, at most (200)"
+    )
+    tuning.add_argument(
+        "--warm-up", type=whole_argument(0), default=5, help="first rows of a track not scored (5)"
     )
     _common_options(parser)
 
 
-def whole(least: int) -> Callable[[str], int]:
+def whole_argument(least: int) -> Callable[[str], int]:
     """Reads a whole number >= `least`."""
 
     def read(text: str) -> int:
@@ -121,7 +132,7 @@ def whole(least: int) -> Callable[[str], int]:
     return read
 
 
-def above(bound: float) -> Callable[[str], float]:
+def above_argument(bound: float) -> Callable[[str], float]:
     """Reads a finite number > `bound`."""
 
     def read(text: str) -> float:
@@ -136,23 +147,23 @@ def above(bound: float) -> Callable[[str], float]:
     return read
 
 
-positive = above(0)
+positive = above_argument(0)
 
 
-def seed(text: str) -> int:
+def seed_argument(text: str) -> int:
     """Reads a seed: what every generator of random numbers takes."""
-    number = whole(0)(text)
+    number = whole_argument(0)(text)
     if number >= 2**32:
         raise argparse.ArgumentTypeError(f"expected a whole number below 2**32, got {text!r}")
     return number
 
 
-def names(text: str) -> list[str]:
+def names_argument(text: str) -> list[str]:
     """Reads column names separated by commas."""
     return [name.strip() for name in text.split(",")]
 
 
-def noise(text: str) -> dict[str, float]:
+def noise_argument(text: str) -> dict[str, float]:
     """Reads one standard deviation (under the name ""), or name=value pairs by sensor."""
     if "=" not in text:
         return {"": positive(text)}

@@ -29,7 +29,7 @@ from ewif_jax.study.shared.folder import Folder
 from ewif_jax.study.shared.refusal import Refused, stop_if_asked
 from ewif_jax.types import Estimator, Numbers
 
-__all__ = ("Experiment", "Measured", "Options", "Refused", "shown")
+__all__ = ("Experiment", "Measured", "Options", "Refused", "shown_number")
 
 
 class Measured(NamedTuple):
@@ -171,7 +171,7 @@ class Experiment:
             numeric = any(isinstance(r[column], float | int | Measured) for r in rows)
             table.add_column(Text(column), justify="right" if numeric else "left")
         for row in rows:
-            table.add_row(*(Text(shown(value)) for value in row.values()))
+            table.add_row(*(Text(shown_number(value)) for value in row.values()))
         self.console.print(table)
         self.csv(name, pd.DataFrame([_flat_row(row) for row in rows]))
 
@@ -212,7 +212,7 @@ class Experiment:
             self.say(f"Unfinished work with other settings stays in {self.folder.partial.parent}.")
 
 
-def shown(value: Numbers) -> str:
+def shown_number(value: Numbers) -> str:
     """A table cell: four significant digits, an error rounded to two, nothing for None."""
     match value:
         case None:

@@ -11,7 +11,7 @@ TRUTH, MEASURED = "#222222", "#9aa7b8"
 EWIF, KALMAN, OTHER = "#1b7837", "#c51b7d", "#2166ac"
 
 
-def canvas(
+def study_canvas(
     rows: int = 1, columns: int = 1, *, width: float = 10, height: float = 4, **options: Any
 ) -> tuple[Figure, Any]:
     """A figure and its axes (an array unless there is one), with quiet grids and no frame lines."""
@@ -36,7 +36,7 @@ def plain_ticks(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.4)))
 
 
-def legend_above(axes: Axes) -> None:
+def legend_in_a_row(axes: Axes) -> None:
     """A legend in one row above the axes, where it hides nothing."""
     place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
     axes.legend(frameon=False, fontsize="small", ncols=5, **place)

@@ -16,7 +16,7 @@ from ewif_jax.lab.identity import source_fingerprint
 from ewif_jax.lab.pieces import (
     Arrays,
     Broken,
-    digest_of,
+    digest_of_file,
     is_half,
     read_piece,
     write_piece,
@@ -124,7 +124,7 @@ class Folder:
         missing = sorted(n for n in self._written if not (self.partial / n).is_file())
         if missing:
             raise Refused(f"{self.partial}: {', '.join(missing)} went missing; run it again")
-        files = {name: digest_of(self.partial / name) for name in sorted(self._written)}
+        files = {name: digest_of_file(self.partial / name) for name in sorted(self._written)}
         text = manifest.sealed({**about, "files": files})
         self.write("about.json", lambda half: half.write_text(text, encoding="utf-8"))
         finishing = self.partial.with_name("finish.lock")

@@ -86,7 +86,7 @@ def history_needed(measurements: Measurement) -> int:
     return needed
 
 
-def rmse(squared: np.ndarray) -> Measured:
+def rmse_of(squared: np.ndarray) -> Measured:
     """Root of the mean of per-run mean squares, with its standard error (delta method)."""
     value = float(np.sqrt(np.mean(squared)))
     error = float(np.std(squared, ddof=1) / np.sqrt(squared.size))
@@ -103,9 +103,9 @@ def paired(squared: np.ndarray, other: np.ndarray) -> Measured:
     return mean_of(np.sqrt(squared) - np.sqrt(other))
 
 
-def rmses(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`rmse` of every row (V, R): values and standard errors (V,)."""
-    found = np.asarray([rmse(row) for row in squared])
+def rmses_of(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`rmse_of` of every row (V, R): values and standard errors (V,)."""
+    found = np.asarray([rmse_of(row) for row in squared])
     return found[:, 0], found[:, 1]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ewif_jax.lab.pieces import Broken, digest_of, read_piece
+from ewif_jax.lab.pieces import Broken, digest_of_file, read_piece
 
 NAME = "about.json"
 
@@ -58,7 +58,7 @@ def _listed_digests(folder: Path) -> dict[str, str] | None:
     if not isinstance(files, dict):
         return None
     if seal == _seal_of(about):
-        files = {**files, NAME: digest_of(folder / NAME)}
+        files = {**files, NAME: digest_of_file(folder / NAME)}
     return files
 
 
@@ -72,7 +72,7 @@ def _is_written(path: Path, files: Mapping[str, str]) -> bool:
         except Broken:
             return False
         return True
-    return path.name in files and digest_of(path) == files[path.name]
+    return path.name in files and digest_of_file(path) == files[path.name]
 
 
 def _seal_of(about: Mapping[str, Any]) -> str:

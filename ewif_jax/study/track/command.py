@@ -11,12 +11,12 @@ import xarray as xr
 
 from ewif_jax.fast.compiling import array
 from ewif_jax.lab.plane import to_degrees
-from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown
+from ewif_jax.study.shared.experiment import Experiment, Measured, Options, shown_number
 from ewif_jax.study.shared.refusal import Refused
 from ewif_jax.study.track import figures as track_figures
 from ewif_jax.study.track.held_out import HeldOut, held_out
 from ewif_jax.study.track.loss import filtered, loss, predicted, report
-from ewif_jax.study.track.method import Method, method
+from ewif_jax.study.track.method import TrackMethod, track_method
 from ewif_jax.study.track.readings import Readings, read
 from ewif_jax.study.track.tracks import Tracks, batch
 from ewif_jax.tuning import Tuned, tune
@@ -54,7 +54,7 @@ def track(arguments: argparse.Namespace, options: Options) -> None:
     counted = tracks.rank() >= arguments.warm_up
     if arguments.tune and not counted.any():
         raise Refused(f"--warm-up: {arguments.warm_up} leaves no measurement to tune by")
-    chosen = method(arguments, tracks)
+    chosen = track_method(arguments, tracks)
     with Experiment("track", options, _command_settings(arguments)) as experiment:
         _followed_tracks(experiment, arguments, readings, tracks, counted, chosen)
 
@@ -65,7 +65,7 @@ def _followed_tracks(
     readings: Readings,
     tracks: Tracks,
     counted: np.ndarray,
-    chosen: Method,
+    chosen: TrackMethod,
 ) -> None:
     _introduce_file(experiment, readings, tracks)
     stamped = {"validity": [group.measurements for group in tracks.groups]}
@@ -76,10 +76,12 @@ def _followed_tracks(
         for stamps, streams in stamped.items()
     ]
     _save_estimates(experiment, readings, tracks, outcomes)
-    experiment.figure("tracks", track_figures.tracks(tracks, outcomes[0].after))
-    experiment.figure("innovations", track_figures.innovations(tracks, outcomes[0], counted))
+    experiment.figure("tracks", track_figures.track_maps(tracks, outcomes[0].after))
+    experiment.figure("innovations", track_figures.innovation_panels(tracks, outcomes[0], counted))
     if arguments.tune:
-        drawn = track_figures.histories(outcomes, chosen.name, chosen.unit, LABEL[arguments.loss])
+        drawn = track_figures.outcome_histories(
+            outcomes, chosen.name, chosen.unit, LABEL[arguments.loss]
+        )
         experiment.figure("tuning", drawn)
     seed = arguments.seed
     rows = [row for o in outcomes for row in _outcome_rows(o, chosen, tracks.row, counted, seed)]
@@ -94,7 +96,7 @@ def _followed_tracks(
 def _setting_outcome(
     experiment: Experiment,
     arguments: argparse.Namespace,
-    chosen: Method,
+    chosen: TrackMethod,
     stamps: str,
     tracks: Tracks,
     streams: list[Measurement],
@@ -145,7 +147,7 @@ def _setting_outcome(
 def _tell_result(
     experiment: Experiment,
     stamps: str,
-    chosen: Method,
+    chosen: TrackMethod,
     label: str,
     tuned: Tuned,
     checked: HeldOut | None,
@@ -153,7 +155,7 @@ def _tell_result(
     """Says how far the parameter is known, what it is worth on other rows, and why it ended."""
     value = tuned.params[chosen.name]
     number = Measured(float(value), np.nan) if checked is None else checked.value
-    said = [f"{chosen.name} = {shown(number)} {chosen.unit} ({stamps} times)"]
+    said = [f"{chosen.name} = {shown_number(number)} {chosen.unit} ({stamps} times)"]
     if checked is not None:
         groups = f"{checked.groups} groups of {checked.of}"
         said.append(
@@ -173,7 +175,7 @@ def _introduce_file(experiment: Experiment, readings: Readings, tracks: Tracks) 
 
 
 def _outcome_rows(
-    outcome: Outcome, chosen: Method, row: np.ndarray, counted: np.ndarray, seed: int
+    outcome: Outcome, chosen: TrackMethod, row: np.ndarray, counted: np.ndarray, seed: int
 ) -> list[dict[str, Any]]:
     pairs = [("given" if outcome.history is None else "before", outcome.value[0], outcome.before)]
     if outcome.history is not None:

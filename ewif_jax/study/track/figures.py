@@ -12,10 +12,10 @@ from ewif_jax.study.shared.figures import (
     MEASURED,
     OTHER,
     TRUTH,
-    canvas,
     label,
-    legend_above,
+    legend_in_a_row,
     plain_ticks,
+    study_canvas,
 )
 from ewif_jax.study.track.tracks import Tracks
 
@@ -23,9 +23,9 @@ MOST = 200
 """Tracks drawn at most."""
 
 
-def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
+def track_maps(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
     """All tracks, and the longest one with its measurements and two standard deviations."""
-    figure, (left, right) = canvas(1, 2, width=11, height=4.8)
+    figure, (left, right) = study_canvas(1, 2, width=11, height=4.8)
     longest = int(np.argmax(np.bincount(found.row)))
     for row in range(min(len(found.name), MOST)):
         place = _track_place(found, row, estimate["mean"])
@@ -48,9 +48,9 @@ def tracks(found: Tracks, estimate: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
+def innovation_panels(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
     """Prediction error and NIS of every scored measurement over time."""
-    figure, (above, below) = canvas(2, 1, width=10, height=6.5, sharex=True)
+    figure, (above, below) = study_canvas(2, 1, width=10, height=6.5, sharex=True)
     time = found.time
     runs = [("", outcome.after, EWIF, "-")]
     if outcome.history is not None:
@@ -72,16 +72,16 @@ def innovations(found: Tracks, outcome: Any, counted: np.ndarray) -> Figure:
             axes.plot(*middle, style, color=color, linewidth=1.8, label=word + text)
         plain_ticks(axes)
     below.axhline(1, color=TRUTH, linewidth=0.8, label="expected mean")
-    legend_above(above)
-    legend_above(below)
+    legend_in_a_row(above)
+    legend_in_a_row(below)
     label(above, "", "one-step prediction error [m]")
     label(below, "time since the track's start [s]", "NIS per component")
     return figure
 
 
-def histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
+def outcome_histories(outcomes: list[Any], name: str, unit: str, loss: str) -> Figure:
     """Parameter and loss by evaluation."""
-    figure, (left, right) = canvas(1, 2, width=10, height=4)
+    figure, (left, right) = study_canvas(1, 2, width=10, height=4)
     for outcome, color in zip(outcomes, (EWIF, KALMAN), strict=False):
         text = f"{outcome.stamps} times: {outcome.value[1]:.3g} {unit}"
         left.semilogy(outcome.history["params"][name], color=color, label=text)

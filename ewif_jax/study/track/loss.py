@@ -15,7 +15,7 @@ from ewif_jax.charges import Cost, density_cost, length_cost, squared_cost
 from ewif_jax.charging import value_charging
 from ewif_jax.scores import average
 from ewif_jax.study.shared.experiment import Measured
-from ewif_jax.study.track.method import Method
+from ewif_jax.study.track.method import TrackMethod
 from ewif_jax.study.track.tracks import Tracks
 from ewif_jax.types import Measurement, Params, Status
 
@@ -66,7 +66,7 @@ Batches = Sequence[tuple[np.ndarray, Measurement]]
 """which tracks, and their measurements (G, T, ...)"""
 
 
-def loss(kind: str, method: Method, batches: Batches) -> Callable[[Any], Array]:
+def loss(kind: str, method: TrackMethod, batches: Batches) -> Callable[[Any], Array]:
     """The loss of the tunable parameter: params -> (), over the arrivals that params["counted"]
     (G, T) of each batch says (1 or 0); those that the filter does not predict are charged."""
     score, cost, finish = LOSSES[kind]
@@ -94,7 +94,7 @@ def loss(kind: str, method: Method, batches: Batches) -> Callable[[Any], Array]:
 
 
 def filtered(
-    method: Method, params: Params, tracks: Tracks, batches: Batches
+    method: TrackMethod, params: Params, tracks: Tracks, batches: Batches
 ) -> dict[str, np.ndarray]:
     """Estimates and diagnostics (N, ...) after every row, one batched call for tracks of like
     length."""

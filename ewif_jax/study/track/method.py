@@ -42,7 +42,7 @@ MOST_LAG = 1000
 """a history that is always allowed; a longer one has to have measurements to hold"""
 
 
-class Method(NamedTuple):
+class TrackMethod(NamedTuple):
     """estimator and params; name, unit and transform of the parameter that can be tuned; prior:
     of all tracks (means (R, n), one covariance)."""
 
@@ -58,7 +58,7 @@ class Method(NamedTuple):
         return None if self.prior is None else Gaussian(self.prior.mean[tracks], self.prior.cov)
 
 
-def method(arguments: argparse.Namespace, tracks: Tracks) -> Method:
+def track_method(arguments: argparse.Namespace, tracks: Tracks) -> TrackMethod:
     """The filter that the arguments ask for.
 
     What is not given follows from the noise s and the median interval dt of the measurements:
@@ -94,7 +94,7 @@ def method(arguments: argparse.Namespace, tracks: Tracks) -> Method:
     params = {"q": q, name: value}
     used = params if arguments.estimator != "ewif" else {name: value}
     params = {key: jnp.asarray(np.asarray(x, float)) for key, x in used.items()}
-    return Method(estimator, params, name, unit, transform, prior)
+    return TrackMethod(estimator, params, name, unit, transform, prior)
 
 
 def _noise_of(given: dict[str, float], sensors: list[str]) -> list[float]:

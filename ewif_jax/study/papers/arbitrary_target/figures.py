@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ewif_jax.study.shared.figures import canvas, label
+from ewif_jax.study.shared.figures import label, study_canvas
 
 LOOK = (
     ("#00a5c8", "--", 1.3),
@@ -23,7 +23,7 @@ SHOWN = (20.0, 40.0)
 
 def snapshot(example: Mapping[str, Any], names: Sequence[str]) -> Figure:
     """Fig. 2: part of the way, with measurements and the four tracks; and all of the truth."""
-    figure, axes = canvas(1, 2, width=13, height=6, width_ratios=(3, 1))
+    figure, axes = study_canvas(1, 2, width=13, height=6, width_ratios=(3, 1))
     start, end = SHOWN
     arrived = (example["arrival"] >= start) & (example["arrival"] <= end)
     measured = (example["time"] >= start) & (example["time"] <= end)
@@ -48,7 +48,7 @@ def animation(
     example: Mapping[str, Any], names: Sequence[str], frames: int
 ) -> Callable[[Path], None]:
     """Writes a GIF of the target, what has arrived, and the newest estimates with their tails."""
-    figure, ax = canvas(width=6.4, height=4.8)
+    figure, ax = study_canvas(width=6.4, height=4.8)
     figure.set_layout_engine("none")
     FigureCanvasAgg(figure)
     moments = np.linspace(3.0, example["arrival"][-1], frames)

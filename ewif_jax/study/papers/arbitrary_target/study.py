@@ -19,7 +19,7 @@ from ewif_jax.scenarios.arbitrary_target import (
 from ewif_jax.study.papers.arbitrary_target import figures
 from ewif_jax.study.papers.two_sided import runs as two_sided
 from ewif_jax.study.shared.experiment import Experiment
-from ewif_jax.study.shared.late import paired, rmse, sweep
+from ewif_jax.study.shared.late import paired, rmse_of, sweep
 from ewif_jax.types import Estimator
 
 TAU, LAG = 2.0, 1.0
@@ -49,11 +49,13 @@ def run(experiment: Experiment) -> None:
         frames = figures.animation(example, list(REGIMES), 5 if experiment.options.quick else 60)
         experiment.folder.write("animation.gif", frames)
     base, *others = squared.items()
-    rows = [{"regime": base[0], "RMSE [m]": rmse(base[1]["squared_error"]), "difference [m]": None}]
+    rows = [
+        {"regime": base[0], "RMSE [m]": rmse_of(base[1]["squared_error"]), "difference [m]": None}
+    ]
     rows += [
         {
             "regime": name,
-            "RMSE [m]": rmse(x["squared_error"]),
+            "RMSE [m]": rmse_of(x["squared_error"]),
             "difference [m]": paired(x["squared_error"], base[1]["squared_error"]),
         }
         for name, x in others
@@ -64,7 +66,7 @@ def run(experiment: Experiment) -> None:
     experiment.table(
         "smoothers",
         f"With the late ones, {fewer} runs, by decay time",
-        two_sided.rows(both, TAUS, list(TAUS).index(TAU)),
+        two_sided.table_rows(both, TAUS, list(TAUS).index(TAU)),
         [
             f"Errors in m. fixed lag: {LAG:g} s behind the arrivals. two-sided: at the times of",
             "the fixed lag, from all the measurements of the minute. above: run by run, best tau.",

@@ -16,7 +16,7 @@ from ewif_jax.oosm.selective import selective
 from ewif_jax.scenarios.arrowhead import arrowhead, arrowhead_model
 from ewif_jax.study.papers.arrowhead import figures as arrowhead_figures
 from ewif_jax.study.shared.experiment import Experiment
-from ewif_jax.study.shared.late import history_needed, paired, rmse, rmses, sweep
+from ewif_jax.study.shared.late import history_needed, paired, rmse_of, rmses_of, sweep
 from ewif_jax.tuning import tune
 from ewif_jax.types import Estimator, PyTree
 
@@ -36,12 +36,12 @@ def cutoffs() -> np.ndarray:
     return np.asarray([0.0, 2.0, 3.0, 4.0, 5.0, stale(), *range(7, 21), np.inf])
 
 
-def selective_al1(lag: int) -> Estimator:
+def arrowhead_al1(lag: int) -> Estimator:
     """Al1 with the random walk model, up to params["cutoff"] seconds."""
     return selective(al1(arrowhead_model(Q, VARIANCE), lag), lambda p: p["cutoff"])
 
 
-def exponential() -> Estimator:
+def exponential_filter() -> Estimator:
     """The EWIF with the same motion and params["tau"]."""
     return ewif(arrowhead_model(0.0, VARIANCE), tau=lambda p: p["tau"])
 
@@ -79,7 +79,7 @@ def run(experiment: Experiment) -> None:
         against = paired(mse, squared[-1])
         return {
             **first,
-            "RMSE [m]": rmse(mse),
+            "RMSE [m]": rmse_of(mse),
             "minus Al1 with everything [m]": against if against.error > 0 else None,
             "late used": f"{100 * used.mean():.0f} %",
         }
@@ -110,7 +110,7 @@ def _cutoff_thresholds(
     label = "Al1, all thresholds"
     with experiment.timed(label), experiment.progress(label) as report:
         return sweep(
-            selective_al1(lag),
+            arrowhead_al1(lag),
             {"cutoff": cutoffs()},
             batch,
             prior=scenario.prior,
@@ -123,7 +123,7 @@ def _cutoff_thresholds(
 def _ewif_errors(experiment: Experiment, scenario: Scenario, batch: Simulation) -> dict[str, Any]:
     """Errors with the tau of the Kalman filter's steady gain, and with the tau that gradient
     descent finds on other runs."""
-    quick, label, estimator = experiment.options.quick, "EWIF: tuning", exponential()
+    quick, label, estimator = experiment.options.quick, "EWIF: tuning", exponential_filter()
     gain = random_walk_gain(maneuvering_index(Q, VARIANCE, 1.0))
     same = -1 / np.log1p(-float(gain))
     training = arrowhead(r=VARIANCE, steps=500 if quick else 1000)
@@ -143,7 +143,7 @@ def _example_laps(
     experiment: Experiment, scenario: Scenario, lag: int, tau: float
 ) -> dict[str, np.ndarray]:
     """Three laps, tracked by each method: positions at the time of each report."""
-    by_al1, by_ewif = selective_al1(lag), exponential()
+    by_al1, by_ewif = arrowhead_al1(lag), exponential_filter()
     filters = {
         "KF": (by_al1, {"cutoff": 0.0}, scenario.prior),
         "selective Al1": (by_al1, {"cutoff": stale()}, scenario.prior),
@@ -161,7 +161,7 @@ def _example_laps(
 
 
 def _arrowhead_arrays(found: PyTree, faded: Any, example: dict[str, np.ndarray]) -> xr.Dataset:
-    values, errors = rmses(found["squared_error"])
+    values, errors = rmses_of(found["squared_error"])
     metres = {"units": "m"}
     at = {"cutoff": ("cutoff", cutoffs(), {"units": "s"})}
 

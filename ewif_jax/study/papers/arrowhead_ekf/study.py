@@ -15,8 +15,8 @@ from ewif_jax.oosm.replay import replay
 from ewif_jax.oosm.selective import selective
 from ewif_jax.scenarios.arrowhead import arrowhead_ekf, arrowhead_ekf_model
 from ewif_jax.study.shared.experiment import Experiment
-from ewif_jax.study.shared.figures import OTHER, canvas, label
-from ewif_jax.study.shared.late import DROPPED, mean_of, rmse, rmses, sweep
+from ewif_jax.study.shared.figures import OTHER, label, study_canvas
+from ewif_jax.study.shared.late import DROPPED, mean_of, rmse_of, rmses_of, sweep
 
 LIMITS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, math.inf)
 """seconds; delays are whole ones, and what is older than the limit is dropped"""
@@ -41,12 +41,12 @@ def run(experiment: Experiment) -> None:
     used = np.stack([one["late_used"] for one in found])
     seconds = np.asarray([1e6 * float(one["seconds"]) / (runs * steps) for one in found])
     slots = [int(one["slots"]) for one in found]
-    least, most = rmse(squared[-1]).value, rmse(squared[0]).value
+    least, most = rmse_of(squared[-1]).value, rmse_of(squared[0]).value
     rows = [
         {
             "maximum delay [s]": limit,
-            "RMSE [m]": rmse(mse),
-            "excess over no limit": f"{100 * (rmse(mse).value - least) / (most - least):.0f} %",
+            "RMSE [m]": rmse_of(mse),
+            "excess over no limit": f"{100 * (rmse_of(mse).value - least) / (most - least):.0f} %",
             "late updates per measurement": mean_of(late),
             "steps filtered again per measurement": mean_of(again),
             "buffer": size,
@@ -140,9 +140,9 @@ def _limited_delay(
 def _draw_figure(
     limits: np.ndarray, squared: np.ndarray, refiltered: np.ndarray, seconds: np.ndarray
 ) -> Any:
-    figure, axes = canvas(1, 2, width=11, height=4.2)
+    figure, axes = study_canvas(1, 2, width=11, height=4.2)
     inside = np.isfinite(limits)
-    values, errors = rmses(squared)
+    values, errors = rmses_of(squared)
     spread = np.sqrt(squared).std(1, ddof=1)
     axes[0].fill_between(
         limits[inside],

@@ -11,9 +11,9 @@ from ewif_jax.study.shared.figures import (
     MEASURED,
     OTHER,
     TRUTH,
-    canvas,
     label,
     plain_ticks,
+    study_canvas,
 )
 
 COLOR = {"none": TRUTH, "noise": KALMAN, "weighting": EWIF, "memory": OTHER}
@@ -23,10 +23,12 @@ ABOVE = {"none": 2.0, "noise": 2.2, "weighting": 2.1, "memory": 2.0}
 POINTS = 14
 
 
-def growth(time: np.ndarray, found: Mapping, exact: Mapping, text: Mapping[str, str]) -> Figure:
+def growth_curves(
+    time: np.ndarray, found: Mapping, exact: Mapping, text: Mapping[str, str]
+) -> Figure:
     """Mean square error against time, exact lines and simulated points, for both pushes; dotted,
     what the filter without a remedy believes."""
-    figure, axes = canvas(1, 2, width=11, height=4.6, sharey=True)
+    figure, axes = study_canvas(1, 2, width=11, height=4.6, sharey=True)
     for ax, push in zip(axes, ("white", "constant"), strict=True):
         for shift, (remedy, color) in enumerate(COLOR.items()):
             line = {"color": color, "linestyle": STYLE[remedy], "zorder": ABOVE[remedy]}
@@ -54,11 +56,11 @@ def growth(time: np.ndarray, found: Mapping, exact: Mapping, text: Mapping[str, 
     return figure
 
 
-def settings(
+def setting_curves(
     gains: np.ndarray, final: Mapping, exact: Mapping, used: float, text: Mapping[str, str]
 ) -> Figure:
     """Error at the end against how fast each remedy forgets, and the error without one."""
-    figure, axes = canvas(1, 2, width=11, height=4.2, sharey=True)
+    figure, axes = study_canvas(1, 2, width=11, height=4.2, sharey=True)
     for ax, push in zip(axes, ("white", "constant"), strict=True):
         ax.axhline(exact[push, "none"][-1], color=TRUTH, label="no remedy")
         for remedy, color in list(COLOR.items())[1:]:

@@ -40,7 +40,7 @@ def setting_for(remedy: Remedy, gain: Numbers) -> Any:
     return {"none": None, "noise": gain**2, "weighting": gain / 2, "memory": 1 / gain}[remedy]
 
 
-def chosen(remedy: Remedy, dt: float) -> float | None:
+def chosen_setting(remedy: Remedy, dt: float) -> float | None:
     """The setting with the least final error under the white push: gain sqrt(eps), or a memory of
     sqrt(3 / eps) s (whole samples)."""
     if remedy == "memory":
@@ -51,7 +51,7 @@ def chosen(remedy: Remedy, dt: float) -> float | None:
 def closed_forms(dt: float) -> dict[tuple[Push, Remedy], tuple[str, float]]:
     """Every closed form of the mean square error, as text and as a number for `EPS`: at `LENGTH`
     without a remedy, and once settled with one."""
-    K, M, t = np.sqrt(EPS), chosen("memory", dt) or 0.0, LENGTH + 1
+    K, M, t = np.sqrt(EPS), chosen_setting("memory", dt) or 0.0, LENGTH + 1
     white, steady = K / 2 + EPS / (2 * K), K / 2 + (EPS / K) ** 2
     return {
         ("white", "none"): (
@@ -77,7 +77,7 @@ def run(experiment: Experiment) -> None:
     runs, dt = experiment.size(4000, 200), 0.1 if quick else 0.02
     time = np.arange(1, round(LENGTH / dt) + 1) * dt
     cases = list(product(PUSHES, REMEDIES))
-    filters = {r: divergence_filter(r, dt=dt, setting=chosen(r, dt)) for r in REMEDIES}
+    filters = {r: divergence_filter(r, dt=dt, setting=chosen_setting(r, dt)) for r in REMEDIES}
 
     found: dict[tuple[Push, Remedy], Arrays] = {}
     for number, push in enumerate(PUSHES):
@@ -91,7 +91,7 @@ def run(experiment: Experiment) -> None:
             found[push, remedy] = {"mse": mse, "mse_se": mse_se}
     exact = {
         (push, remedy): np.asarray(
-            divergence_curve(remedy, push, time, eps=EPS, setting=chosen(remedy, dt))
+            divergence_curve(remedy, push, time, eps=EPS, setting=chosen_setting(remedy, dt))
         )
         for push, remedy in cases
     }
@@ -108,8 +108,8 @@ def run(experiment: Experiment) -> None:
         if remedy != "none"
     }
     experiment.arrays("divergence", _divergence_arrays(time, found, exact, final))
-    experiment.figure("divergence", figures.growth(time, found, exact, TEXT))
-    experiment.figure("settings", figures.settings(GAINS, final, exact, np.sqrt(EPS), TEXT))
+    experiment.figure("divergence", figures.growth_curves(time, found, exact, TEXT))
+    experiment.figure("settings", figures.setting_curves(GAINS, final, exact, np.sqrt(EPS), TEXT))
     forms = closed_forms(dt)
     rows = [_claim_row(case, found[case], exact[case], forms[case], dt) for case in cases]
     printed = 1 / (LENGTH + 1) + EPS * (LENGTH + 1) / 2
@@ -135,7 +135,7 @@ def _claim_row(
     case: tuple[Push, Remedy], one: Arrays, exact: np.ndarray, form: tuple[str, float], dt: float
 ) -> dict[str, Any]:
     push, remedy = case
-    setting = chosen(remedy, dt)
+    setting = chosen_setting(remedy, dt)
     return {
         "push": push,
         "remedy": TEXT[remedy],

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ewif_jax.study.shared.figures import OTHER, TRUTH, canvas, label
+from ewif_jax.study.shared.figures import OTHER, TRUTH, label, study_canvas
 
 
 def low(case: Any, ages: np.ndarray, gains: np.ndarray, closed_form: Callable) -> Figure:
     """Fig. 1: four sequences and the approximation (1 - lambda)^(T / dT) lambda."""
-    figure, axes = canvas(width=7, height=4.2)
+    figure, axes = study_canvas(width=7, height=4.2)
     for age, gain in zip(ages[:4], gains[:4, :, 0], strict=True):
         axes.semilogy(age, gain, ".--", color=OTHER, linewidth=0.7, markersize=3)
     line = np.linspace(0, ages[:4].max(), 100)
@@ -28,7 +28,7 @@ def low(case: Any, ages: np.ndarray, gains: np.ndarray, closed_form: Callable) -
 
 def typical(case: Any, ages: np.ndarray, gains: np.ndarray, closed_form: Callable) -> Figure:
     """Fig. 2: five sequences, and a hundred as dots."""
-    figure, axes = canvas(1, 2, width=11, height=4.2, sharey=True)
+    figure, axes = study_canvas(1, 2, width=11, height=4.2, sharey=True)
     for age, gain in zip(ages[:5], gains[:5, :, 0], strict=True):
         axes[0].semilogy(age, gain, ".--", color=OTHER, linewidth=0.7, markersize=4)
     axes[1].semilogy(
@@ -47,7 +47,7 @@ def typical(case: Any, ages: np.ndarray, gains: np.ndarray, closed_form: Callabl
 
 def velocity(case: Any, ages: np.ndarray, gains: np.ndarray, closed_form: Callable) -> Figure:
     """Fig. 3: one sequence, gains of position and velocity."""
-    figure, axes = canvas(1, 2, width=11, height=4.2)
+    figure, axes = study_canvas(1, 2, width=11, height=4.2)
     line = np.linspace(0, ages[0].max(), 200)
     theory = closed_form(case, line)
     units = ("[1]", "[1/s]")

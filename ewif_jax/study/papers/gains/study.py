@@ -23,7 +23,7 @@ SETTLING = 400
 AGES = (0, 1, 2, 4, 8)
 
 
-class Case(NamedTuple):
+class GainCase(NamedTuple):
     """One figure: the system F(dt), Q(dt), H with r = 1, the mean interval in seconds, how many
     measurements back the gains are followed, and the names of the state's components."""
 
@@ -36,7 +36,7 @@ class Case(NamedTuple):
     components: tuple[str, ...]
 
 
-def cases() -> tuple[Case, Case, Case]:
+def gain_cases() -> tuple[GainCase, GainCase, GainCase]:
     """Random walks with a maneuvering index of 0.032 and 1, and position with velocity.
 
     Fig. 2 prints lambda = 1 and sigma_Q^2 = 0.5, hence an interval of 2 s. The noise of Fig. 3 is
@@ -45,9 +45,9 @@ def cases() -> tuple[Case, Case, Case]:
     still, one = (lambda dt: jnp.eye(1)), jnp.ones((1, 1))
     noise = jnp.asarray([[0.0, 0.0], [0.0, 0.01]])
     return (
-        Case("fig1", 0.1, still, lambda dt: 0.01 * dt * one, one, 60, ("position",)),
-        Case("fig2", 2.0, still, lambda dt: 0.5 * dt * one, one, 12, ("position",)),
-        Case(
+        GainCase("fig1", 0.1, still, lambda dt: 0.01 * dt * one, one, 60, ("position",)),
+        GainCase("fig2", 2.0, still, lambda dt: 0.5 * dt * one, one, 12, ("position",)),
+        GainCase(
             "fig3",
             0.2,
             lambda dt: jnp.asarray([[1.0, 0.0], [0.0, 1.0]]).at[0, 1].set(dt),
@@ -59,7 +59,7 @@ def cases() -> tuple[Case, Case, Case]:
     )
 
 
-def actual(case: Case, keys: Array) -> tuple[np.ndarray, np.ndarray]:
+def actual(case: GainCase, keys: Array) -> tuple[np.ndarray, np.ndarray]:
     """Ages (R, L+1) in seconds of the last measurements of each run, and their gains (R, L+1, n)
     in its last estimate."""
     steps = case.lag + SETTLING
@@ -76,7 +76,7 @@ def actual(case: Case, keys: Array) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(ages), np.asarray(gains)
 
 
-def closed_form(case: Case, ages: Numbers) -> np.ndarray:
+def closed_form(case: GainCase, ages: Numbers) -> np.ndarray:
     """The gain (..., n) of eq. (5), or (7) for a random walk, at `ages` in seconds."""
     system = case.F(case.interval), case.H, case.Q(case.interval), jnp.eye(1)
     if case.H.shape[1] == 1:
@@ -90,7 +90,7 @@ def run(experiment: Experiment) -> None:
     """Follows the gains, compares them with the closed forms, and draws."""
     runs = experiment.size(1000, 20)
     found, rows, arrays = {}, [], {}
-    for number, case in enumerate(cases()):
+    for number, case in enumerate(gain_cases()):
         with experiment.timed(case.name):
             keys = jax.random.split(experiment.key(number), runs)
             ages, gains = actual(case, keys)
@@ -126,7 +126,9 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _gain_rows(case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray) -> list[dict]:
+def _gain_rows(
+    case: GainCase, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray
+) -> list[dict]:
     rows = []
     for i, component in enumerate(case.components):
         row: dict[str, Any] = {
@@ -152,7 +154,7 @@ def _over_scale(measured: Measured, scale: float) -> Measured:
 
 
 def _gain_arrays(
-    case: Case, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray
+    case: GainCase, ages: np.ndarray, gains: np.ndarray, theory: np.ndarray
 ) -> dict[str, xr.DataArray]:
     back, name = f"{case.name}_back", case.name
     dims = ("run", back, f"{name}_component")

@@ -21,13 +21,13 @@ LAGS = (1, 2, 3, 5)
 MOTIONS = {"random walk": (random_walk, 1), "white-noise acceleration": (constant_velocity, 2)}
 
 
-def methods(model: Model) -> dict[str, Estimator]:
+def loss_methods(model: Model) -> dict[str, Estimator]:
     """The methods that take a late measurement in one step."""
     every = max(LAGS)
     return {"al1": al1(model, every), "bl1": bl1(model, every), "a1": a1(model), "b1": b1(model)}
 
 
-def arrivals(lag: int) -> np.ndarray:
+def arrival_pairs(lag: int) -> np.ndarray:
     """Times of a measurement every second until the filter has settled, and then of one that was
     taken in the middle of an interval, `lag` update times back."""
     return np.append(np.arange(1.0, SETTLED + 1), SETTLED - lag + 0.5)
@@ -81,8 +81,8 @@ def relative_errors() -> list[dict[str, Any]]:
     rows = []
     for motion, (build, n) in MOTIONS.items():
         model = build(sensors=position_sensor(1.0), q=1.0)
-        times = np.stack([arrivals(lag) for lag in LAGS])
-        found = {name: responses(one, n, times) for name, one in methods(model).items()}
+        times = np.stack([arrival_pairs(lag) for lag in LAGS])
+        found = {name: responses(one, n, times) for name, one in loss_methods(model).items()}
         for i, lag in enumerate(LAGS):
             state, seen = sources(model, n, times[i])
             true = {

@@ -7,20 +7,20 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from ewif_jax.study.shared.figures import EWIF, KALMAN, OTHER, TRUTH, canvas, label
-from ewif_jax.study.shared.late import DROPPED, rmse, rmses
+from ewif_jax.study.shared.figures import EWIF, KALMAN, OTHER, TRUTH, label, study_canvas
+from ewif_jax.study.shared.late import DROPPED, rmse_of, rmses_of
 
 EXACT = "#222222"
 
 
-def methods(
+def method_panels(
     cases: Sequence[Any],
     found: Sequence[Mapping[str, np.ndarray]],
     theoretical: Callable[[float], float],
     multiples: np.ndarray,
 ) -> Figure:
     """Fig. 4: RMSE against the cut-off, one panel for each process noise."""
-    figure, axes = canvas(1, 3, width=13, height=4.4)
+    figure, axes = study_canvas(1, 3, width=13, height=4.4)
     inside = np.isfinite(multiples) & (multiples > 0)
     for ax, case, one in zip(axes, cases, found, strict=True):
         limit = theoretical(case.sigma)
@@ -32,10 +32,10 @@ def methods(
             ("EWIF, everything", one["ewif"], EWIF, "-."),
         )
         for name, mse, color, style in levels:
-            value, error = rmse(mse)
+            value, error = rmse_of(mse)
             ax.axhspan(value - error, value + error, color=color, alpha=0.12, linewidth=0)
             ax.axhline(value, color=color, linestyle=style, linewidth=1.2, label=name)
-        values, errors = rmses(squared)
+        values, errors = rmses_of(squared)
         ax.errorbar(
             multiples[inside] * limit,
             values[inside],
@@ -54,7 +54,7 @@ def methods(
     return figure
 
 
-def delays(
+def delay_panels(
     squared: np.ndarray,
     sigmas: Sequence[float],
     mean_delays: np.ndarray,
@@ -64,13 +64,13 @@ def delays(
 ) -> Figure:
     """Figs. 5 (linear, narrow) and 6 (logarithmic, wide): one curve for each mean delay, from
     `squared` (V, sigmas, delays, R)."""
-    figure, axes = canvas(2, 2, width=11, height=7.5)
+    figure, axes = study_canvas(2, 2, width=11, height=7.5)
     colors = colormaps["viridis"](np.linspace(0, 0.9, mean_delays.size))
     shown = np.isfinite(multiples) & ((multiples > 0) if wide else (multiples <= 5))
     for number, (ax, sigma) in enumerate(zip(axes.flat, sigmas, strict=True)):
         limit = theoretical(sigma)
         for i, delay in enumerate(mean_delays):
-            values, errors = rmses(squared[:, number, i])
+            values, errors = rmses_of(squared[:, number, i])
             best = int(np.argmin(values[shown]))
             cutoffs = multiples[shown] * limit
             ax.errorbar(

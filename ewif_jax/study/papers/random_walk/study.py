@@ -19,7 +19,7 @@ from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scores import average, scored, squared_error
 from ewif_jax.study.papers.random_walk import figures
 from ewif_jax.study.shared.experiment import Experiment
-from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse, rmses, sweep
+from ewif_jax.study.shared.late import exact_late, history_needed, paired, rmse_of, rmses_of, sweep
 from ewif_jax.tuning import tune
 from ewif_jax.types import Estimator, PyTree
 
@@ -30,7 +30,7 @@ AT_CUTOFF = 7
 DELAYS = np.asarray([0.05, 0.2, 1.0, 5.0, 20.0, 100.0])
 
 
-class Case(NamedTuple):
+class WalkCase(NamedTuple):
     """One panel of Fig. 4: process noise sigma_Q in m/sqrt(s) and mean delay in seconds."""
 
     name: str
@@ -38,9 +38,9 @@ class Case(NamedTuple):
     delay: float
 
 
-CASES = (Case("4a", 0.5, 50.0), Case("4b", 5.0, 4.0), Case("4c", 50.0, 0.75))
+CASES = (WalkCase("4a", 0.5, 50.0), WalkCase("4b", 5.0, 4.0), WalkCase("4c", 50.0, 0.75))
 SIGMAS = (0.5, 5.0, 50.0, 500.0)
-SWEPT = tuple(Case("", sigma, delay) for sigma in SIGMAS for delay in DELAYS)
+SWEPT = tuple(WalkCase("", sigma, delay) for sigma in SIGMAS for delay in DELAYS)
 """Figs. 5 and 6"""
 
 
@@ -50,14 +50,14 @@ def theoretical(sigma: float) -> float:
     return float(random_walk_cutoff(index, ratio=RATIO, interval=INTERVAL))
 
 
-def selective_al1(lag: int) -> Estimator:
+def walk_al1(lag: int) -> Estimator:
     """Al1 with params["q"], up to params["cutoff"] seconds."""
     return selective(al1(random_walk_model(lambda p: p["q"], VARIANCE), lag), lambda p: p["cutoff"])
 
 
 def recovered(squared: np.ndarray) -> np.ndarray:
     """Share (V,) of the way from the first RMSE (drop) to the last (Al1 with everything)."""
-    values, _ = rmses(squared)
+    values, _ = rmses_of(squared)
     return (values[0] - values) / (values[0] - values[-1])
 
 
@@ -81,9 +81,9 @@ def run(experiment: Experiment) -> None:
     found = [{name: x[..., i, :] for name, x in compared.items()} for i in range(len(CASES))]
     panels = swept["squared_error"].reshape(MULTIPLES.size, len(SIGMAS), DELAYS.size, few)
     experiment.arrays("random_walk", _walk_arrays(compared, panels))
-    experiment.figure("fig4", figures.methods(CASES, found, theoretical, MULTIPLES))
+    experiment.figure("fig4", figures.method_panels(CASES, found, theoretical, MULTIPLES))
     for name, wide in (("fig5", False), ("fig6", True)):
-        drawn = figures.delays(panels, SIGMAS, DELAYS, theoretical, MULTIPLES, wide)
+        drawn = figures.delay_panels(panels, SIGMAS, DELAYS, theoretical, MULTIPLES, wide)
         experiment.figure(name, drawn)
     experiment.table(
         "delays",
@@ -114,7 +114,7 @@ def run(experiment: Experiment) -> None:
 
 
 def _simulated_cases(
-    experiment: Experiment, cases: Sequence[Case], runs: int, steps: int, number: int
+    experiment: Experiment, cases: Sequence[WalkCase], runs: int, steps: int, number: int
 ) -> Simulation:
     """`runs` runs of each case, one case after the other."""
 
@@ -129,7 +129,7 @@ def _simulated_cases(
 
 
 def _by_cutoff(
-    experiment: Experiment, cases: Sequence[Case], batch: Simulation
+    experiment: Experiment, cases: Sequence[WalkCase], batch: Simulation
 ) -> dict[str, np.ndarray]:
     """Averages (V, C, R) of the selective filter at every multiple of each case's T_d."""
     label = f"Al1, all cut-offs of {len(cases)} cases"
@@ -139,7 +139,7 @@ def _by_cutoff(
     scenario = random_walk()
     with experiment.timed(label), experiment.progress(label) as report:
         found = sweep(
-            selective_al1(history_needed(batch.measurements)),
+            walk_al1(history_needed(batch.measurements)),
             {
                 "cutoff": MULTIPLES[:, None] * np.repeat(limits, runs),
                 "q": np.tile(q, (MULTIPLES.size, 1)),
@@ -197,28 +197,28 @@ def _compared_methods(experiment: Experiment, runs: int, steps: int) -> dict[str
     }
 
 
-def _steady_gain(case: Case) -> float:
+def _steady_gain(case: WalkCase) -> float:
     return float(random_walk_gain(maneuvering_index(case.sigma**2, VARIANCE, INTERVAL)))
 
 
-def _methods_of(case: Case, found: PyTree) -> dict[str, Any]:
+def _methods_of(case: WalkCase, found: PyTree) -> dict[str, Any]:
     squared = found["squared_error"]
     return {
         "": case.name,
         "sigma_Q": case.sigma,
         "mean delay [s]": case.delay,
         "T_d [s]": theoretical(case.sigma),
-        "KF, drop": rmse(squared[0]),
-        "selective Al1 at T_d": rmse(squared[AT_CUTOFF]),
-        "Al1, all": rmse(squared[-1]),
-        "exact": rmse(found["exact"]),
-        "EWIF": rmse(found["ewif"]),
+        "KF, drop": rmse_of(squared[0]),
+        "selective Al1 at T_d": rmse_of(squared[AT_CUTOFF]),
+        "Al1, all": rmse_of(squared[-1]),
+        "exact": rmse_of(found["exact"]),
+        "EWIF": rmse_of(found["ewif"]),
         "τ [s]": float(found["tau"][0]),
         "τ of the same gain [s]": float(found["tau_same_gain"][0]),
     }
 
 
-def _recovery_ratio(case: Case, squared: np.ndarray) -> dict[str, Any]:
+def _recovery_ratio(case: WalkCase, squared: np.ndarray) -> dict[str, Any]:
     share = recovered(squared)
     return {
         "": case.name,
@@ -232,16 +232,16 @@ def _recovery_ratio(case: Case, squared: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _case_row(case: Case, squared: np.ndarray) -> dict[str, Any]:
-    share, values = recovered(squared), rmses(squared)[0]
+def _case_row(case: WalkCase, squared: np.ndarray) -> dict[str, Any]:
+    share, values = recovered(squared), rmses_of(squared)[0]
     counts = values[0] > 1.02 * values[-1]
     return {
         "sigma_Q": case.sigma,
         "T_d [s]": theoretical(case.sigma),
         "mean delay [s]": float(case.delay),
-        "KF, drop": rmse(squared[0]),
-        "at T_d": rmse(squared[AT_CUTOFF]),
-        "Al1, all": rmse(squared[-1]),
+        "KF, drop": rmse_of(squared[0]),
+        "at T_d": rmse_of(squared[AT_CUTOFF]),
+        "Al1, all": rmse_of(squared[-1]),
         "recovered at T_d": f"{100 * share[AT_CUTOFF]:.0f} %" if counts else None,
         "95 % at [T_d]": reach(share, 0.95) if counts else None,
         "best cut-off [T_d]": float(MULTIPLES[np.argmin(values)]),

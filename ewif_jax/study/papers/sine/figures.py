@@ -6,16 +6,16 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from ewif_jax.study.shared.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, canvas, label
+from ewif_jax.study.shared.figures import EWIF, KALMAN, MEASURED, OTHER, TRUTH, label, study_canvas
 
 COLOR = {"EWIF": EWIF, "KF": KALMAN}
 SYMBOL = {"EWIF": r"$\tau$", "KF": r"$\sigma_w$"}
 MARKS = (("o", "published"), ("s", "tuned on samples"), ("*", "exact optimum"))
 
 
-def tracks(example: dict[str, xr.DataArray]) -> Figure:
+def sine_tracks(example: dict[str, xr.DataArray]) -> Figure:
     """Fig. 1 of the paper: truth, measurements and the two estimates of one run."""
-    figure, axes = canvas(width=9, height=4.5)
+    figure, axes = study_canvas(width=9, height=4.5)
     time = example["truth"]["time"]
     axes.plot(time, example["measured"], ".", color=MEASURED, label="measurements")
     axes.plot(time, example["truth"], color=TRUTH, linewidth=1.2, label="truth")
@@ -28,11 +28,13 @@ def tracks(example: dict[str, xr.DataArray]) -> Figure:
     return figure
 
 
-def curves(found: dict[str, Any]) -> Figure:
+def loss_curves(found: dict[str, Any]) -> Figure:
     """RMSE against the parameter: exact line, simulated points, and where each setting lies; below,
     by how much the simulated values differ from the exact ones."""
     shape = {"height_ratios": (3, 1)}
-    figure, axes = canvas(2, 2, width=10, height=6, sharex="col", sharey="row", gridspec_kw=shape)
+    figure, axes = study_canvas(
+        2, 2, width=10, height=6, sharex="col", sharey="row", gridspec_kw=shape
+    )
     for (above, below), (name, (one, of)) in zip(axes.T, found.items(), strict=True):
         color, value, error = COLOR[name], of["value"], 2 * of["rmse_se"]
         points = {"fmt": ".", "color": TRUTH, "capsize": 3, "label": "Monte Carlo ± 2 s.e."}
@@ -59,9 +61,9 @@ def curves(found: dict[str, Any]) -> Figure:
     return figure
 
 
-def histories(found: dict[str, Any]) -> Figure:
+def tuning_histories(found: dict[str, Any]) -> Figure:
     """Parameter and loss, gradient step by gradient step."""
-    figure, axes = canvas(2, 2, width=10, height=6, sharex=True)
+    figure, axes = study_canvas(2, 2, width=10, height=6, sharex=True)
     for (above, below), (name, (one, of)) in zip(axes.T, found.items(), strict=True):
         color = COLOR[name]
         descents = [("on samples", OTHER, ":", of["sampled_path"], of["sampled_loss"])]

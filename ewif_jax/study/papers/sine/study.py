@@ -110,9 +110,9 @@ def run(experiment: Experiment) -> None:
     example = _example_track(experiment, pair)
     notes += _equivalent_tau(experiment, pair[0], float(found["KF"][1]["exact"][0]))
     experiment.arrays("sine", xr.Dataset({**series, **example}))
-    experiment.figure("tracks", sine_figures.tracks(example))
-    experiment.figure("rmse", sine_figures.curves(found))
-    experiment.figure("tuning", sine_figures.histories(found))
+    experiment.figure("tracks", sine_figures.sine_tracks(example))
+    experiment.figure("rmse", sine_figures.loss_curves(found))
+    experiment.figure("tuning", sine_figures.tuning_histories(found))
     runs = experiment.size(10_000, 500)
     _smoother_table(experiment)
     experiment.table("sine", f"Sine: {runs} runs of 101 samples, RMSE in m", rows, notes)
@@ -129,12 +129,12 @@ def _smoother_table(experiment: Experiment) -> None:
             batch = simulate_batch(
                 sine(dt=DT, r=VARIANCE), jax.random.split(experiment.key(4), runs)
             )
-            return two_sided.compared(sine_model(VARIANCE, DT), taus, batch, steps=BEHIND)
+            return two_sided.compared_means(sine_model(VARIANCE, DT), taus, batch, steps=BEHIND)
 
     experiment.table(
         "smoothers",
         f"EWIF, filtering and smoothing: {runs} runs, RMSE in m",
-        two_sided.rows(experiment.piece("smoothers", compute), taus, list(taus).index(0.5)),
+        two_sided.table_rows(experiment.piece("smoothers", compute), taus, list(taus).index(0.5)),
         [
             f"fixed lag: {BEHIND * DT:g} s. two-sided: all the samples of the run. above: run by",
             "run, best tau. Scored at the times that all three report.",

@@ -17,8 +17,8 @@ from ewif_jax.oosm.selective import selective
 from ewif_jax.scenarios.arrowhead import arrowhead, arrowhead_model
 from ewif_jax.study.papers.arrowhead.study import VARIANCE, stale
 from ewif_jax.study.shared.experiment import Experiment
-from ewif_jax.study.shared.figures import EWIF, OTHER, TRUTH, canvas, label
-from ewif_jax.study.shared.late import history_needed, paired, rmse, sweep
+from ewif_jax.study.shared.figures import EWIF, OTHER, TRUTH, label, study_canvas
+from ewif_jax.study.shared.late import history_needed, paired, rmse_of, sweep
 from ewif_jax.tuning import Tuned, tune
 from ewif_jax.types import Estimator, Gaussian, PyTree
 
@@ -26,7 +26,7 @@ SOFTNESS = 0.5
 """width of the soft cut-off in seconds: half the spacing of the possible delays"""
 
 
-class Method(NamedTuple):
+class DelayMethod(NamedTuple):
     """A method with a cut-off: build(lag, softness), the parameter beside the cut-off, its symbol
     and published value, the grid of both, and whether the start is known."""
 
@@ -42,7 +42,7 @@ class Method(NamedTuple):
 CUTOFFS = np.asarray([0.0, 2.0, 3.0, 4.0, 5.0, stale(), 8.0, 12.0, 20.0, np.inf])
 
 
-def methods() -> tuple[Method, Method]:
+def delay_methods() -> tuple[DelayMethod, DelayMethod]:
     """Al1 in (q, cut-off) and EWIF in (tau, cut-off)."""
 
     def by_al1(lag: int, softness: float | None) -> Estimator:
@@ -57,8 +57,8 @@ def methods() -> tuple[Method, Method]:
     qs = 20.0 * np.asarray([0.5, 1, 2, 4, 6, 8, 12, 16])
     taus = np.asarray([1.5, 2.5, 3, 3.5, 4, 5, 7, 10])
     return (
-        Method("Al1", by_al1, "q", "q [m²/s]", 20.0, qs, True),
-        Method("EWIF", by_ewif, "tau", "τ [s]", 10.0, taus, False),
+        DelayMethod("Al1", by_al1, "q", "q [m²/s]", 20.0, qs, True),
+        DelayMethod("EWIF", by_ewif, "tau", "τ [s]", 10.0, taus, False),
     )
 
 
@@ -72,7 +72,7 @@ def run(experiment: Experiment) -> None:
     seen = simulate_batch(few, jax.random.split(experiment.key(1), 4 if quick else 16))
     lag = max(history_needed(x.measurements) for x in (batch, seen))
     rows, arrays, drawn = [], {}, []
-    for one in methods():
+    for one in delay_methods():
         prior = scenario.prior if one.prior else None
         found = experiment.piece(
             one.name, lambda m=one, p=prior: _found_optimum(experiment, m, lag, seen, batch, p)
@@ -100,7 +100,7 @@ def run(experiment: Experiment) -> None:
 
 def _found_optimum(
     experiment: Experiment,
-    one: Method,
+    one: DelayMethod,
     lag: int,
     seen: Simulation,
     batch: Simulation,
@@ -135,7 +135,7 @@ def _found_optimum(
 
 
 def _tuned_cutoff(
-    experiment: Experiment, one: Method, soft: Estimator, seen: Simulation, setting: Any
+    experiment: Experiment, one: DelayMethod, soft: Estimator, seen: Simulation, setting: Any
 ) -> Tuned:
     label = f"{one.name}: tuning"
     start = {one.parameter: one.published, "cutoff": 2.0}
@@ -145,7 +145,7 @@ def _tuned_cutoff(
         return tune(loss, start, method="adam", steps=steps, progress=report)
 
 
-def _optimum_rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
+def _optimum_rows(one: DelayMethod, found: PyTree) -> list[dict[str, Any]]:
     squared, values, cutoffs = found["squared"], found["parameter"], found["cutoff"]
     best = 2 + int(np.argmin(squared[2:].mean(1)))
     picked = [
@@ -161,7 +161,7 @@ def _optimum_rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
             "parameter": one.symbol,
             "value": float(values[i]),
             "cut-off [s]": float(cutoffs[i]),
-            "RMSE [m]": rmse(mse),
+            "RMSE [m]": rmse_of(mse),
             "minus published [m]": paired(mse, squared[0]) if i else None,
             "minus best of the grid [m]": paired(mse, squared[best]) if i != best else None,
         }
@@ -169,7 +169,7 @@ def _optimum_rows(one: Method, found: PyTree) -> list[dict[str, Any]]:
     ]
 
 
-def _optimum_arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
+def _optimum_arrays(one: DelayMethod, found: PyTree) -> dict[str, xr.DataArray]:
     name, metres = one.name, {"units": "m"}
     grid = found["squared"][2:].reshape(one.grid.size, CUTOFFS.size, -1)
     return {
@@ -194,9 +194,9 @@ def _optimum_arrays(one: Method, found: PyTree) -> dict[str, xr.DataArray]:
     }
 
 
-def _draw_landscape(drawn: list[tuple[Method, Any]]) -> Figure:
+def _draw_landscape(drawn: list[tuple[DelayMethod, Any]]) -> Figure:
     """RMSE over the grid, the way of the descent, and where it ends."""
-    figure, axes = canvas(1, 2, width=12, height=4.8)
+    figure, axes = study_canvas(1, 2, width=12, height=4.8)
     shown = np.isfinite(CUTOFFS)
     for ax, (one, found) in zip(axes, drawn, strict=True):
         mean = np.sqrt(found["squared"][2:].mean(1)).reshape(one.grid.size, CUTOFFS.size)
@@ -221,9 +221,9 @@ def _draw_landscape(drawn: list[tuple[Method, Any]]) -> Figure:
     return figure
 
 
-def _draw_descent(drawn: list[tuple[Method, Any]]) -> Figure:
+def _draw_descent(drawn: list[tuple[DelayMethod, Any]]) -> Figure:
     """Parameter, cut-off and loss, gradient step by gradient step."""
-    figure, axes = canvas(1, 3, width=13, height=3.8)
+    figure, axes = study_canvas(1, 3, width=13, height=3.8)
     colors = {"Al1": OTHER, "EWIF": EWIF}
     twin = axes[0].twinx()
     for ax, (one, found) in zip((axes[0], twin), drawn, strict=True):

@@ -20,7 +20,7 @@ from ewif_jax.study.papers.turn.runs import (
 from ewif_jax.study.shared.claims import Claim, at_any_of, judged, quotient, ratio, share, surest
 from ewif_jax.study.shared.experiment import Measured
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.study.shared.late import rmse
+from ewif_jax.study.shared.late import rmse_of
 from ewif_jax.study.shared.one_by_one import seconds_per_run
 
 SETTLED, LATER, LOST = 5, 20, 500.0
@@ -28,7 +28,7 @@ SECONDS = TIMES.size - SETTLED
 """how many seconds are compared one by one"""
 
 
-class Evidence(NamedTuple):
+class TurnEvidence(NamedTuple):
     """What was measured: of every filter, of the bounds, and how many numbers each filter holds."""
 
     found: dict[str, Arrays]
@@ -36,10 +36,10 @@ class Evidence(NamedTuple):
     held: dict[str, int]
 
 
-Decider = Callable[[Evidence], Measured]
+Decider = Callable[[TurnEvidence], Measured]
 
 
-def settled(found: Arrays, kind: str = "position") -> np.ndarray:
+def settled_mean(found: Arrays, kind: str = "position") -> np.ndarray:
     """Mean squared error (R,) of the position or the velocity from 5 s on."""
     return found[kind][:, SETTLED:].mean(1)
 
@@ -47,10 +47,10 @@ def settled(found: Arrays, kind: str = "position") -> np.ndarray:
 def against(name: str, other: str) -> Decider:
     """The ratio of the RMS position errors of two filters on the runs that both were given."""
 
-    def position_ratio(evidence: Evidence) -> Measured:
+    def position_ratio(evidence: TurnEvidence) -> Measured:
         first, second = (evidence.found[each]["position"] for each in (name, other))
         runs = min(first.shape[0], second.shape[0])
-        return ratio(*(settled({"position": x[:runs]}) for x in (first, second)))
+        return ratio(*(settled_mean({"position": x[:runs]}) for x in (first, second)))
 
     return position_ratio
 
@@ -58,7 +58,7 @@ def against(name: str, other: str) -> Decider:
 def surest_second(name: str, other: str) -> Decider:
     """The ratio of the RMS velocity errors of two filters where it is above 1 most surely."""
 
-    def velocity_ratio(evidence: Evidence) -> Measured:
+    def velocity_ratio(evidence: TurnEvidence) -> Measured:
         first, second = (evidence.found[each]["velocity"] for each in (name, other))
         return surest(ratio(first[:, -k], second[:, -k]) for k in range(1, SECONDS + 1))
 
@@ -72,20 +72,20 @@ def lost_runs(name: str) -> Decider:
     )
 
 
-def over_the_bound(evidence: Evidence) -> Measured:
+def over_the_bound(evidence: TurnEvidence) -> Measured:
     """The velocity error of PFord in units of the parametric bound."""
     floor = np.sqrt(np.mean(evidence.bound["parametric_velocity"][SETTLED:]))
-    velocity = rmse(settled(evidence.found[ORD], "velocity"))
+    velocity = rmse_of(settled_mean(evidence.found[ORD], "velocity"))
     return Measured(velocity.value / floor, velocity.error / floor)
 
 
-def storage_ratio(evidence: Evidence) -> Measured:
+def storage_ratio(evidence: TurnEvidence) -> Measured:
     """Numbers that PFoosmEXT keeps only for late data, over those of PFoosmEKS."""
     held = evidence.held
     return Measured((held[EXT] - held[STD]) / (held[EKS] - held[STD]), 0.0)
 
 
-def smoother_cost(evidence: Evidence) -> Measured:
+def smoother_cost(evidence: TurnEvidence) -> Measured:
     """Time that PFoosmPS takes for a late measurement, in steps of the filter that drops them."""
     late, in_sequence = evidence.found[PS], evidence.found[STD]
     whole = quotient(*(seconds_per_run(x["core_seconds"]) for x in (late, in_sequence)))
@@ -142,7 +142,9 @@ CLAIMS = (
 )
 
 
-def claims(found: dict[str, Arrays], bound: Arrays, held: dict[str, int]) -> list[dict[str, Any]]:
+def turn_claims(
+    found: dict[str, Arrays], bound: Arrays, held: dict[str, int]
+) -> list[dict[str, Any]]:
     """What the paper says about its filters, and one comparison that it does not make."""
-    evidence = Evidence(found, bound, held)
+    evidence = TurnEvidence(found, bound, held)
     return [judged(each, each.decider(evidence)) for each in CLAIMS]

@@ -13,9 +13,9 @@ from ewif_jax.study.shared.figures import (
     MEASURED,
     OTHER,
     TRUTH,
-    canvas,
     label,
     plain_ticks,
+    study_canvas,
 )
 from ewif_jax.study.shared.late import DROPPED
 
@@ -33,9 +33,9 @@ GIVEN_UP = {"EKF": ("#f4a582", ":"), "UKF": ("#92c5de", ":")}
 UNITS = {"position": "m", "velocity": "m/s"}
 
 
-def tracks(found: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+def turn_tracks(found: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
     """Fig. 2 and more: the path, the sensors, and how three filters follow the first run."""
-    figure, axes = canvas(width=7, height=6.5)
+    figure, axes = study_canvas(width=7, height=6.5)
     time = np.arange(31.0)
     axes.plot(*np.asarray(turn_state(np.linspace(0, 30, 200)))[:, :2].T, color=TRUTH, label="truth")
     axes.plot(*np.asarray(turn_state(time))[:, :2].T, ".", color=TRUTH, markersize=4)
@@ -50,11 +50,11 @@ def tracks(found: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
     return figure
 
 
-def rms(
+def rms_panel(
     found: Mapping[str, Mapping[str, np.ndarray]], bound: Mapping[str, np.ndarray], kind: str
 ) -> Figure:
     """Figs. 3 and 4: RMS error against time, with bounds."""
-    figure, axes = canvas(width=11, height=5.5)
+    figure, axes = study_canvas(width=11, height=5.5)
     time = np.arange(31.0)
     for name, (color, style) in (LOOK | GIVEN_UP).items():
         if len(found[name][kind]) < len(found["PFstd"][kind]) and len(found[name][kind]) < 100:
@@ -85,13 +85,13 @@ def rms(
     return figure
 
 
-def pareto(
+def pareto_front(
     errors: Mapping[str, Measured],
     found: Mapping[str, Mapping[str, np.ndarray]],
     held: Mapping[str, int],
 ) -> Figure:
     """Error against time on one core; the area of a mark grows with the numbers stored."""
-    figure, axes = canvas(width=9, height=5)
+    figure, axes = study_canvas(width=9, height=5)
     costs = {name: found[name]["core_seconds"].mean() for name in LOOK}
     for name in sorted(LOOK, key=lambda name: costs[name]):
         color, (value, error) = LOOK[name][0], errors[name]

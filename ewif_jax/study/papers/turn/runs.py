@@ -31,7 +31,7 @@ PRINTED = {"ut_alpha": 1e-3, "ut_beta": 2.0, "ut_kappa": 0.0}
 """sigma points of the paper"""
 
 
-class Method(NamedTuple):
+class TurnMethod(NamedTuple):
     """An estimator, whether its stream is in order of time, and the share of the runs it is given
     (what is only a reference needs fewer)."""
 
@@ -40,7 +40,7 @@ class Method(NamedTuple):
     share: float = 1.0
 
 
-def methods(particles: int = 10_000) -> dict[str, Method]:
+def turn_methods(particles: int = 10_000) -> dict[str, TurnMethod]:
     """The six filters of the paper, the exact answer of the particle filter, and the two filters
     that the paper gave up. Its sigma points need float64; in float32 those of the cubature rule
     take their place."""
@@ -48,30 +48,30 @@ def methods(particles: int = 10_000) -> dict[str, Method]:
     in_sequence = bootstrap(model, particles)
     points = PRINTED if _as_printed() else {}
 
-    def smoothing(smoother: Any, **setting: Any) -> Method:
-        return Method(pf_fixed_point(model, particles, LAG, smoother, **setting))
+    def smoothing(smoother: Any, **setting: Any) -> TurnMethod:
+        return TurnMethod(pf_fixed_point(model, particles, LAG, smoother, **setting))
 
     return {
-        STD: Method(drop_late(in_sequence)),
-        ORD: Method(in_sequence, in_order=True),
-        EXT: Method(pf_extended(model, particles, LAG)),
+        STD: TurnMethod(drop_late(in_sequence)),
+        ORD: TurnMethod(in_sequence, in_order=True),
+        EXT: TurnMethod(pf_extended(model, particles, LAG)),
         EKS: smoothing("eks"),
         UKS: smoothing("uks", **points),
         PS: smoothing("ps"),
-        EXACT: Method(replay(in_sequence, BUFFER, width=2), share=0.1),
-        EKF: Method(extended(model)),
-        UKF: Method(unscented(model, **points)),
+        EXACT: TurnMethod(replay(in_sequence, BUFFER, width=2), share=0.1),
+        EKF: TurnMethod(extended(model)),
+        UKF: TurnMethod(unscented(model, **points)),
     }
 
 
 def sigma_points_note() -> str:
-    """Which sigma points `methods` uses."""
+    """Which sigma points `turn_methods` uses."""
     if _as_printed():
         return "PFoosmUKS and UKF: sigma points as printed, alpha = 1e-3, beta = 2, kappa = 0."
     return "PFoosmUKS and UKF: cubature points; float32 cannot carry the printed alpha = 1e-3."
 
 
-def simulated(key: RandomKey, runs: int) -> dict[bool, Simulation]:
+def turn_worlds(key: RandomKey, runs: int) -> dict[bool, Simulation]:
     """The same runs as they arrive (False) and in order of time (True)."""
     keys = jax.random.split(key, runs)
     return {
@@ -80,14 +80,14 @@ def simulated(key: RandomKey, runs: int) -> dict[bool, Simulation]:
     }
 
 
-def followed(method: Method, batch: Simulation, keys: RandomKey) -> Arrays:
+def followed_turns(method: TurnMethod, batch: Simulation, keys: RandomKey) -> Arrays:
     """Of every run (R,) of a batch in the order that the method asks for: the track (R, 31, 2),
     squared errors of position and velocity (R, 31) at each second, counts of what became of the
     measurements, and core_seconds."""
     return _turn_tracker(method.estimator, method.in_order)(batch, keys)
 
 
-def bounds(batch: Simulation) -> Arrays:
+def turn_bounds(batch: Simulation) -> Arrays:
     """Variances (T,) of position and velocity without the third sensor and, "late_", with what has
     arrived of it (an average over runs); and "parametric_", for a target that is known to turn
     steadily. The others are bounds for targets that the noise of the model drives, on average: on

@@ -11,18 +11,18 @@ from ewif_jax.analysis.storage import storage
 from ewif_jax.monte_carlo import Simulation
 from ewif_jax.study.papers.turn import figures
 from ewif_jax.study.papers.turn import runs as runs_of
-from ewif_jax.study.papers.turn.claims import SETTLED, claims, settled
+from ewif_jax.study.papers.turn.claims import SETTLED, settled_mean, turn_claims
 from ewif_jax.study.papers.turn.runs import (
     EKS,
     EXACT,
     LAG,
     TIMES,
-    Method,
+    TurnMethod,
 )
 from ewif_jax.study.shared.claims import ratio
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.study.shared.late import mean_of, rmse
+from ewif_jax.study.shared.late import mean_of, rmse_of
 from ewif_jax.study.shared.late_methods import storage_rows
 from ewif_jax.study.shared.one_by_one import seconds_per_run
 
@@ -34,22 +34,22 @@ def run(experiment: Experiment) -> None:
     """Simulates, runs every filter, and compares errors, storage and cost with the paper."""
     quick = experiment.options.quick
     runs = experiment.size(2000, 8)
-    used = runs_of.methods(1000 if quick else 10_000)
+    used = runs_of.turn_methods(1000 if quick else 10_000)
     with experiment.timed("simulation"):
-        worlds = runs_of.simulated(experiment.key(0), runs)
+        worlds = runs_of.turn_worlds(experiment.key(0), runs)
     found = {
         name: _tracked_runs(experiment, i, name, method, worlds[method.in_order])
         for i, (name, method) in enumerate(used.items())
     }
     some = jax.tree.map(lambda x: x[:100], worlds[False])
     with experiment.timed("bounds"):
-        bound = experiment.piece("bounds", lambda: runs_of.bounds(some))
+        bound = experiment.piece("bounds", lambda: runs_of.turn_bounds(some))
     held = {name: storage(method.estimator, 5).numbers for name, method in used.items()}
     experiment.arrays("turn", _turn_arrays(found, bound, held))
-    experiment.figure("tracks", figures.tracks(found))
+    experiment.figure("tracks", figures.turn_tracks(found))
     for number, kind in ((3, "position"), (4, "velocity")):
-        experiment.figure(f"fig{number}_{kind}", figures.rms(found, bound, kind))
-    experiment.figure("pareto", figures.pareto(overall(found), found, held))
+        experiment.figure(f"fig{number}_{kind}", figures.rms_panel(found, bound, kind))
+    experiment.figure("pareto", figures.pareto_front(overall(found), found, held))
     experiment.table(
         "storage",
         f"Storage, lag {LAG}",
@@ -68,7 +68,7 @@ def run(experiment: Experiment) -> None:
     experiment.table(
         "claims",
         "What the paper says",
-        claims(found, bound, held),
+        turn_claims(found, bound, held),
         [
             "The parametric bound is that of a steady turn. Bounds of noisy motion hold on average",
             "over targets that the noise drives: on this one smooth path a filter may be better.",
@@ -82,12 +82,12 @@ def run(experiment: Experiment) -> None:
 def overall(found: dict[str, Arrays], kind: str = "position") -> dict[str, Measured]:
     """RMS error of every filter; of one that was given fewer runs, its ratio to PFoosmEKS on them
     times the error of that one."""
-    errors = {name: rmse(settled(one, kind)) for name, one in found.items()}
-    every = settled(found[EKS], kind)
+    errors = {name: rmse_of(settled_mean(one, kind)) for name, one in found.items()}
+    every = settled_mean(found[EKS], kind)
     for name, one in found.items():
         runs = one[kind].shape[0]
         if runs < every.size:
-            part, whole = ratio(settled(one, kind), every[:runs]), errors[EKS]
+            part, whole = ratio(settled_mean(one, kind), every[:runs]), errors[EKS]
             value = part.value * whole.value
             spread = np.hypot(part.error / part.value, whole.error / whole.value)
             errors[name] = Measured(value, float(value * spread))
@@ -98,7 +98,7 @@ def _tracked_runs(
     experiment: Experiment,
     number: int,
     name: str,
-    method: Method,
+    method: TurnMethod,
     batch: Simulation,
 ) -> Arrays:
     """Every run of one filter, in blocks that an interrupted study need not repeat."""
@@ -110,7 +110,7 @@ def _tracked_runs(
         index = slice(begin, min(begin + BLOCK, runs))
         some = jax.tree.map(lambda x: x[index], batch)
         with experiment.timed(name):
-            return runs_of.followed(method, some, keys[index])
+            return runs_of.followed_turns(method, some, keys[index])
 
     found = []
     with experiment.progress(name) as report:

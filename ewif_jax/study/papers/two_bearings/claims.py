@@ -32,7 +32,7 @@ ALL_FIVE = (EKF, RTS, ENKF1, ENKF2, PF)
 RIVALS = (EKF, RTS, ENKF2, SHARED, EXACT)
 
 
-class Evidence(NamedTuple):
+class BearingsEvidence(NamedTuple):
     """By filter: mean squared errors `off`, squared mean standard deviations `sd` (D, R), runs that
     are `gone`, and seconds on one core; `printed`: the square of the published bound (D, R)."""
 
@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
         return ~np.any([self.gone[name][delay] for name in names], 0)
 
 
-Decider = Callable[[Evidence], tuple[Measured, int | None]]
+Decider = Callable[[BearingsEvidence], tuple[Measured, int | None]]
 """Gives the number that decides, and from how many runs it comes (None: all)."""
 
 
@@ -69,7 +69,7 @@ def lost(error: np.ndarray) -> np.ndarray:
 def error_ratio(name: str, other: str) -> Decider:
     """RMSE over RMSE at 10 s, of the runs that neither filter lost."""
 
-    def decided(evidence: Evidence) -> tuple[Measured, int | None]:
+    def decided(evidence: BearingsEvidence) -> tuple[Measured, int | None]:
         both = evidence.kept(TEN, name, other)
         pair = (evidence.off[each][TEN][both] for each in (name, other))
         return ratio(*pair), int(both.sum())
@@ -80,7 +80,7 @@ def error_ratio(name: str, other: str) -> Decider:
 def spread_ratio(name: str, other: str) -> Decider:
     """SD over SD at 5 s, of the runs that neither filter lost."""
 
-    def decided(evidence: Evidence) -> tuple[Measured, int | None]:
+    def decided(evidence: BearingsEvidence) -> tuple[Measured, int | None]:
         both = evidence.kept(FIVE, name, other)
         pair = (evidence.sd[each][FIVE][both] for each in (name, other))
         return ratio(*pair), int(both.sum())
@@ -114,7 +114,7 @@ def lost_by_both(name: str, other: str, delay: int) -> Decider:
     return lambda evidence: (share(evidence.gone[name][delay] & evidence.gone[other][delay]), None)
 
 
-def spread_of_five(evidence: Evidence) -> tuple[Measured, int | None]:
+def spread_of_five(evidence: BearingsEvidence) -> tuple[Measured, int | None]:
     """The largest over the smallest SD of five filters without delay."""
     alike = evidence.kept(NONE, *ALL_FIVE)
     ranked = sorted(ALL_FIVE, key=lambda name: evidence.sd[name][NONE][alike].mean())
@@ -122,7 +122,7 @@ def spread_of_five(evidence: Evidence) -> tuple[Measured, int | None]:
     return ratio(*pair), int(alike.sum())
 
 
-def nearest_rival(evidence: Evidence) -> tuple[Measured, int | None]:
+def nearest_rival(evidence: BearingsEvidence) -> tuple[Measured, int | None]:
     """RMSE over that of EnKF1 at 5 s, of the filter from which EnKF1 differs least surely."""
     both = {name: evidence.kept(FIVE, ENKF1, name) for name in RIVALS}
     off = evidence.off
@@ -132,7 +132,7 @@ def nearest_rival(evidence: Evidence) -> tuple[Measured, int | None]:
     return nearest, min(int(runs.sum()) for runs in both.values())
 
 
-def printed_bound(evidence: Evidence) -> tuple[Measured, int | None]:
+def printed_bound(evidence: BearingsEvidence) -> tuple[Measured, int | None]:
     """The bound as printed over the SD of the EKF at 5 s."""
     seen = evidence.kept(FIVE, EKF)
     pair = (x[FIVE][seen] for x in (evidence.printed, evidence.sd[EKF]))
@@ -172,9 +172,11 @@ CLAIMS = (
 )
 
 
-def claims(found: dict[str, Arrays], bound: Arrays, times: np.ndarray) -> list[dict[str, Any]]:
+def bearings_claims(
+    found: dict[str, Arrays], bound: Arrays, times: np.ndarray
+) -> list[dict[str, Any]]:
     """What the paper says about its filters, and three comparisons it does not make."""
-    evidence = Evidence(
+    evidence = BearingsEvidence(
         off={name: squared(x["error"], times) for name, x in found.items()},
         sd={name: reported(x["variance"], times) ** 2 for name, x in found.items()},
         gone={name: lost(x["error"]) for name, x in found.items()},

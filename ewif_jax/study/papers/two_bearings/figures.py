@@ -13,11 +13,11 @@ from ewif_jax.study.shared.figures import (
     MEASURED,
     OTHER,
     TRUTH,
-    canvas,
     label,
     plain_ticks,
+    study_canvas,
 )
-from ewif_jax.study.shared.late import rmse
+from ewif_jax.study.shared.late import rmse_of
 
 LOOK = {
     "Fil-1 (sensor 1)": ("#b35806", ":"),
@@ -36,9 +36,9 @@ SHOWN = ("EKF (Al1)", "RTS-based", "EnKF1", "EnKF2", "EnKF2, shared noise", "PF"
 Found = Mapping[str, Mapping[str, np.ndarray]]
 
 
-def tracks(found: Found, truth: np.ndarray, at: int, delay: float) -> Figure:
+def bearing_tracks(found: Found, truth: np.ndarray, at: int, delay: float) -> Figure:
     """Figs. 1, 6 and 11: the first run under delay number `at`, and how the filters follow it."""
-    figure, axes = canvas(width=9, height=4.8)
+    figure, axes = study_canvas(width=9, height=4.8)
     for name in ("Fil-1 (sensor 1)", "Fil-2 (sensor 2)", *SHOWN):
         color, style = LOOK[name]
         track = truth + found[name]["error"][at, 0]
@@ -54,12 +54,12 @@ def tracks(found: Found, truth: np.ndarray, at: int, delay: float) -> Figure:
     return figure
 
 
-def errors(
+def bearing_errors(
     found: Found, bound: Mapping[str, np.ndarray], times: np.ndarray, at: int, delay: float
 ) -> Figure:
     """Figs. 2-5, 7-10 and 12-15: reported deviation and absolute error of x and of y, medians over
     the runs under delay number `at`."""
-    figure, axes = canvas(2, 2, width=11, height=7.5, sharex=True, sharey="row")
+    figure, axes = study_canvas(2, 2, width=11, height=7.5, sharex=True, sharey="row")
     for column, axis in enumerate("xy"):
         for name in (*SHOWN, "EKF, exact replay"):
             color, style = LOOK[name]
@@ -102,11 +102,11 @@ def by_delay(
     delays: Sequence[float],
 ) -> Figure:
     """RMSE (a hollow mark where runs are lost) and median error of every filter by delay."""
-    figure, axes = canvas(width=10, height=5)
+    figure, axes = study_canvas(width=10, height=5)
     for k, (name, (color, _)) in enumerate(LOOK.items()):
         offset = (k - len(LOOK) / 2) * 0.075
         for place in range(len(delays)):
-            value, error = rmse(squared[name][place])
+            value, error = rmse_of(squared[name][place])
             axes.errorbar(
                 place + offset,
                 value,
@@ -121,7 +121,7 @@ def by_delay(
             axes.plot(place + offset, median, "_", color=color, markersize=9)
     for place in range(len(delays)):
         axes.hlines(
-            rmse(floor[place]).value,
+            rmse_of(floor[place]).value,
             place - 0.45,
             place + 0.45,
             color=MEASURED,

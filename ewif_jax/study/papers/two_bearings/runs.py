@@ -35,7 +35,7 @@ PF, HALF, EXACT, DROP = "PF", "PF, half as many", "EKF, exact replay", "EKF, lat
 ONE, OTHER = "Fil-1 (sensor 1)", "Fil-2 (sensor 2)"
 
 
-class Method(NamedTuple):
+class BearingsMethod(NamedTuple):
     """An estimator, the clock it runs by, and the only sensor it hears (None: both)."""
 
     estimator: Estimator
@@ -53,26 +53,26 @@ class World(NamedTuple):
     times: np.ndarray
 
 
-def methods(particles: int = 10_000) -> dict[str, Method]:
+def bearings_methods(particles: int = 10_000) -> dict[str, BearingsMethod]:
     """The seven of the paper, the particle filter with half the particles, and the baselines."""
     model = two_bearings_model()
     ekf = al1(model, LAG)
     return {
-        ONE: Method(ekf, sensor=0),
-        OTHER: Method(ekf, sensor=1),
-        EKF: Method(ekf),
-        RTS: Method(rts_reference(model, LAG)),
-        ENKF1: Method(enkf1(model, MEMBERS, LAG)),
-        ENKF2: Method(enkf2(model, MEMBERS, LAG)),
-        SHARED: Method(enkf2(model, MEMBERS, LAG, "shared")),
-        PF: Method(pf_retrodict(model, particles, collapse=None)),
-        HALF: Method(pf_retrodict(model, particles // 2, collapse=None)),
-        DROP: Method(drop_late(extended(model)), "validity"),
-        EXACT: Method(replay(extended(model), LAG, width=1)),
+        ONE: BearingsMethod(ekf, sensor=0),
+        OTHER: BearingsMethod(ekf, sensor=1),
+        EKF: BearingsMethod(ekf),
+        RTS: BearingsMethod(rts_reference(model, LAG)),
+        ENKF1: BearingsMethod(enkf1(model, MEMBERS, LAG)),
+        ENKF2: BearingsMethod(enkf2(model, MEMBERS, LAG)),
+        SHARED: BearingsMethod(enkf2(model, MEMBERS, LAG, "shared")),
+        PF: BearingsMethod(pf_retrodict(model, particles, collapse=None)),
+        HALF: BearingsMethod(pf_retrodict(model, particles // 2, collapse=None)),
+        DROP: BearingsMethod(drop_late(extended(model)), "validity"),
+        EXACT: BearingsMethod(replay(extended(model), LAG, width=1)),
     }
 
 
-def simulated(key: RandomKey, runs: int) -> World:
+def bearings_world(key: RandomKey, runs: int) -> World:
     """The same targets under every delay."""
     keys = jax.random.split(key, runs)
     batches = [per_run(simulate_batch(two_bearings(delay), keys)) for delay in DELAYS]
@@ -87,7 +87,7 @@ def simulated(key: RandomKey, runs: int) -> World:
     return World(together, jnp.concatenate([keys] * len(DELAYS)), np.stack(times))
 
 
-def followed(method: Method, world: World, key: RandomKey) -> Arrays:
+def followed_bearings(method: BearingsMethod, world: World, key: RandomKey) -> Arrays:
     """Errors and reported variances of x and y (D, R, T, 2), NaN in the padding, and core_seconds
     (D, R) of every run."""
     batch = world.batch
@@ -100,7 +100,7 @@ def followed(method: Method, world: World, key: RandomKey) -> Arrays:
     return {name: x.reshape(len(DELAYS), -1, *x.shape[1:]) for name, x in found.items()}
 
 
-def bounds(world: World) -> Arrays:
+def bearings_bounds(world: World) -> Arrays:
     """Variances of x and y (D, R, T, 2) that no filter can beat ("right"), and those that the paper
     prints ("published")."""
     prior, model = _bearings_scenario().prior, two_bearings_model()

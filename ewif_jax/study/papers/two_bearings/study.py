@@ -9,18 +9,25 @@ import xarray as xr
 from ewif_jax.analysis.storage import storage
 from ewif_jax.study.papers.two_bearings import figures
 from ewif_jax.study.papers.two_bearings import runs as runs_of
-from ewif_jax.study.papers.two_bearings.claims import LOST, SETTLED, claims, lost, reported, squared
+from ewif_jax.study.papers.two_bearings.claims import (
+    LOST,
+    SETTLED,
+    bearings_claims,
+    lost,
+    reported,
+    squared,
+)
 from ewif_jax.study.papers.two_bearings.runs import (
     DELAYS,
     LAG,
     MEMBERS,
-    Method,
+    BearingsMethod,
     World,
 )
 from ewif_jax.study.shared.claims import share
 from ewif_jax.study.shared.experiment import Experiment
 from ewif_jax.study.shared.folder import Arrays
-from ewif_jax.study.shared.late import mean_of, rmse
+from ewif_jax.study.shared.late import mean_of, rmse_of
 from ewif_jax.study.shared.late_methods import storage_rows
 from ewif_jax.study.shared.one_by_one import seconds_per_run
 
@@ -28,9 +35,9 @@ from ewif_jax.study.shared.one_by_one import seconds_per_run
 def run(experiment: Experiment) -> None:
     """Simulates each delay, runs every filter on it, and compares them with the paper."""
     runs = experiment.size(100, 8)
-    used = runs_of.methods(1000 if experiment.options.quick else 10_000)
+    used = runs_of.bearings_methods(1000 if experiment.options.quick else 10_000)
     with experiment.timed("simulation"):
-        world = runs_of.simulated(experiment.key(0), runs)
+        world = runs_of.bearings_world(experiment.key(0), runs)
     found = {
         name: experiment.piece(
             f"filter-{i}", partial(_timed_filter, experiment, name, method, world)
@@ -38,12 +45,14 @@ def run(experiment: Experiment) -> None:
         for i, (name, method) in enumerate(used.items())
     }
     with experiment.timed("bounds"):
-        bound = experiment.piece("bounds", lambda: runs_of.bounds(world))
+        bound = experiment.piece("bounds", lambda: runs_of.bearings_bounds(world))
     truth = np.reshape(world.batch.truth, (len(DELAYS), runs, -1, 2))
     for k, delay in enumerate(DELAYS):
         stem = f"delay_{delay:g}s"
-        experiment.figure(f"{stem}_tracks", figures.tracks(found, truth[k, 0], k, delay))
-        experiment.figure(f"{stem}_errors", figures.errors(found, bound, world.times[k], k, delay))
+        experiment.figure(f"{stem}_tracks", figures.bearing_tracks(found, truth[k, 0], k, delay))
+        experiment.figure(
+            f"{stem}_errors", figures.bearing_errors(found, bound, world.times[k], k, delay)
+        )
     experiment.figure("delays", figures.by_delay(*_mean_squares(found, bound, world.times), DELAYS))
     experiment.arrays("two_bearings", _bearings_arrays(found, bound, world.times))
     experiment.table("storage", f"Storage, lag {LAG}", storage_rows(4, 1, lag=LAG, members=MEMBERS))
@@ -59,7 +68,7 @@ def run(experiment: Experiment) -> None:
     experiment.table(
         "claims",
         "What the paper says",
-        claims(found, bound, world.times),
+        bearings_claims(found, bound, world.times),
         [
             "runs: how many decide. Ratios are over those in which neither filter is ever",
             f"{LOST:g} m off. Nearest rival: of EKF, RTS-based, EnKF2, also with shared noise, and",
@@ -69,9 +78,11 @@ def run(experiment: Experiment) -> None:
     experiment.finish()
 
 
-def _timed_filter(experiment: Experiment, name: str, method: Method, world: World) -> Arrays:
+def _timed_filter(
+    experiment: Experiment, name: str, method: BearingsMethod, world: World
+) -> Arrays:
     with experiment.timed(name):
-        return runs_of.followed(method, world, experiment.key(1))
+        return runs_of.followed_bearings(method, world, experiment.key(1))
 
 
 def _mean_squares(
@@ -84,7 +95,7 @@ def _mean_squares(
 
 
 def _filter_rows(
-    found: dict[str, Arrays], bound: Arrays, times: np.ndarray, used: dict[str, Method]
+    found: dict[str, Arrays], bound: Arrays, times: np.ndarray, used: dict[str, BearingsMethod]
 ) -> list[dict[str, Any]]:
     off, _, gone = _mean_squares(found, bound, times)
     rows: list[dict[str, Any]] = []
@@ -94,7 +105,7 @@ def _filter_rows(
                 {
                     "delay [s]": delay,
                     "estimator": name,
-                    "RMSE [m]": rmse(off[name][k]),
+                    "RMSE [m]": rmse_of(off[name][k]),
                     "mean SD [m]": mean_of(reported(found[name]["variance"], times)[k]),
                     "median [m]": float(np.median(np.sqrt(off[name][k]))),
                     "lost": share(gone[name][k]),
@@ -103,7 +114,7 @@ def _filter_rows(
                 }
             )
         for name, kind in (("PCRLB", "right"), ("PCRLB as published", "published")):
-            value = rmse(squared(np.sqrt(bound[kind]), times)[k])
+            value = rmse_of(squared(np.sqrt(bound[kind]), times)[k])
             empty: dict[str, Any] = dict.fromkeys(rows[0])
             rows.append({**empty, "delay [s]": delay, "estimator": name, "RMSE [m]": value})
     return rows

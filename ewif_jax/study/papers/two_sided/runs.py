@@ -14,7 +14,7 @@ from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Simulation
 from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 from ewif_jax.smoothers.two_sided_ewif import two_sided_ewif
-from ewif_jax.study.shared.late import paired, rmse
+from ewif_jax.study.shared.late import paired, rmse_of
 from ewif_jax.types import Measurement
 
 RANKS = (1, 2, 1, 2)
@@ -58,7 +58,7 @@ def _mean_square(means: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.nanmean(squares, axis=1)
 
 
-def compared(
+def compared_means(
     model: Model, taus: np.ndarray, batch: Simulation, *, steps: int
 ) -> dict[str, np.ndarray]:
     """Mean squared errors (V, R) of the filter, of its fixed lag of `steps` samples, and of the
@@ -98,7 +98,7 @@ def _seen_mean(step: Step, _: Any) -> Array:
     return step.mean
 
 
-def rows(squared: dict[str, np.ndarray], taus: np.ndarray, used: int) -> list[dict[str, Any]]:
+def table_rows(squared: dict[str, np.ndarray], taus: np.ndarray, used: int) -> list[dict[str, Any]]:
     """The rows of a table: errors with tau = taus[used], with each method's best of `taus`, and how
     much the two-sided estimate, also with its best, is better on the same runs."""
     best = {name: int(np.argmin(x.mean(1))) for name, x in squared.items()}
@@ -106,9 +106,9 @@ def rows(squared: dict[str, np.ndarray], taus: np.ndarray, used: int) -> list[di
     return [
         {
             "estimate": name,
-            f"RMSE, tau = {taus[used]:g} s": rmse(x[used]),
+            f"RMSE, tau = {taus[used]:g} s": rmse_of(x[used]),
             "best tau [s]": f"{taus[best[name]]:.3g}",
-            "RMSE there": rmse(x[best[name]]),
+            "RMSE there": rmse_of(x[best[name]]),
             "above the two-sided": None
             if name == "two-sided"
             else paired(x[best[name]], both[best["two-sided"]]),
