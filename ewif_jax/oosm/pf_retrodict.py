@@ -76,7 +76,7 @@ def pf_retrodict(
             Q = jnp.asarray(model.process_cov(params, then, state.time), state.time.dtype)
             # The noise comes off first and the motion after it, as (89) has them: x(k) = f(x(l)) +
             # v.
-            origin = state.particles - form.process_draws(key, Q, particles)
+            origin = state.particles - form.gaussian_draws(key, Q, particles)
             return state, form.transported(model, params, origin, state.time, then)
 
         is_late = weighing.is_late(state, measurement)

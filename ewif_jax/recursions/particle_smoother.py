@@ -49,7 +49,7 @@ def lines(
     Deviations: the printed recursion does not say that particles are weighed by y(m).
     """
     key, first, second = jax.random.split(key, 3)
-    drawn = start.mean[:, None] + form.process_draws(first, symmetric.unpack(start.cov), count)
+    drawn = start.mean[:, None] + form.gaussian_draws(first, symmetric.unpack(start.cov), count)
     _, there = form.moved_particles(model, params, drawn, second, start.time, tau)
     log_weights = jnp.full(count, -jnp.log(jnp.asarray(count, there.dtype)), there.dtype)
 

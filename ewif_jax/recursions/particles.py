@@ -60,12 +60,12 @@ def drawn_particles(kind: Cloud, prior: Gaussian, t0: Array, key: Array) -> Part
     """Equally weighted particles drawn from the prior, whose covariance may be singular."""
     N, dtype = kind.particles, t0.dtype
     key, ours = jax.random.split(key)
-    particles = prior.mean[:, None] + process_draws(ours, prior.cov, N)
+    particles = prior.mean[:, None] + gaussian_draws(ours, prior.cov, N)
     log_weights = jnp.full(N, -jnp.log(jnp.asarray(N, dtype)), dtype)
     return ParticleState(t0, particles, log_weights, key)
 
 
-def process_draws(key: Array, cov: Array, count: int) -> Array:
+def gaussian_draws(key: Array, cov: Array, count: int) -> Array:
     """(n, count) draws from N(0, cov), cov (n, n) singular or not."""
     # The factor skips pivots that are zero, so that a singular covariance (a constant velocity
     # driven by one acceleration) needs no small noise added to it.
@@ -80,7 +80,7 @@ def moved_particles(
     still = transported(model, params, particles, t0, t1)
     Q = jnp.asarray(model.process_cov(params, t0, t1), particles.dtype)
     checks.shape("Q", Q, (particles.shape[0],) * 2)
-    return still, still + process_draws(key, Q, particles.shape[1])
+    return still, still + gaussian_draws(key, Q, particles.shape[1])
 
 
 def transported(model: Model, params: Params, particles: Array, t0: Array, t1: Array) -> Array:
