@@ -128,6 +128,8 @@ def psd(argument: str, x: Numbers, definite: bool = False) -> Any:
     square = value.ndim == 2 and value.shape[0] == value.shape[1]
     require(square, argument, "a square matrix", f"shape {value.shape}")
     finite(argument, value)
+    # A live filter asks about the same R at every step: small matrices are kept, by their bytes;
+    # large ones would fill the table.
     spectrum = _spectrum_of if value.nbytes <= SMALL else _spectrum_of.__wrapped__
     scale, skew, smallest, apart = spectrum(value.astype(float).tobytes(), len(value))
     require(skew <= 1e-5 * scale, argument, "a symmetric matrix", f"asymmetry {skew:.3g}")

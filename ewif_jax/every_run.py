@@ -75,6 +75,8 @@ def _sifted_measurements(measurements: Measurement) -> Screened | None:
     if not _values_at_hand(measurements):
         return None
     same_dtype = np.asarray(measurements.value).dtype == dtype
+    # The usual case in one pass over the values: a batch without bad numbers makes no copy and no
+    # mask.
     if same_dtype and checks.squares_are_finite(measurements.value):
         return None
     screened = screen(jax.tree.map(np.asarray, measurements), dtype)
@@ -174,6 +176,8 @@ def _name_forgotten(
     ]
     if not names:
         return
+    # Tried with one run's share of what was not marked: only if that is accepted was the mark what
+    # was missing, and the message may say so.
     first = jax.tree.map(lambda x, f: x if f or np.shape(x)[:1] != (runs,) else x[0], params, flags)
     try:
         filter_one(first)
@@ -232,6 +236,8 @@ def _worst_prior(prior: Gaussian | None, flags: PyTree) -> Gaussian | None:
     cov = checks.concrete_value(prior.cov) if flags.cov else None
     k = 0
     if cov is not None:
+        # By the largest element of each run: what is asymmetric or indefinite by rounding depends
+        # on units.
         scale = np.maximum(np.abs(cov).max((1, 2)), np.finfo(float).tiny)
         skew = np.abs(cov - np.swapaxes(cov, 1, 2)).max((1, 2)) / scale
         k = int(np.argmax(skew)) if skew.max() > 1e-5 else _least_definite(cov, scale)

@@ -104,6 +104,8 @@ def _run_parallel(
     padded = jax.tree.map(partial(_padded_series, to=blocks * block), (measurements, times))
     absent = (jnp.arange(blocks * block) >= steps)[:, None]
     measurements = padded[0]._replace(mask=padded[0].mask & ~absent)
+    # Blocks are the last axis: they are a batch, and kernels of small matrices take batches there
+    # (`fast/README.md`).
     cut = partial(_blocks_last, blocks=blocks)
     arrivals, reports = jax.tree.map(cut, (measurements, padded[1]))
 

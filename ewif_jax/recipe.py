@@ -89,6 +89,8 @@ def from_recipe(builder: Callable[Given, Made]) -> Callable[Given, Made]:
         for name, value in bound.arguments.items():
             bound.arguments[name] = settled(value)
         made = builder(*bound.args, **bound.kwargs)
+        # A builder may return what another builder made (a wrapper that changes nothing): written
+        # on that object, the recipe would rename it for everybody who holds it.
         own = type(made)(*made)  # pyright: ignore  (it may be what another builder made)
         own.__dict__["_recipe"] = Recipe(build, bound)
         return own
@@ -201,6 +203,7 @@ def content_key(x: Any) -> Hashable:
         raise NotConcreteError
     if isinstance(x, FromRecipe) and x.recipe is not None:
         return x.recipe.concrete_key
+    # With its type: True == 1 == 1.0 in Python, but they make different programs.
     if x is None or isinstance(x, bool | int | str | bytes):
         return type(x), x
     if isinstance(x, np.ndarray | np.generic | jax.Array):
@@ -231,6 +234,7 @@ def _array_key(x: Any) -> Hashable:
     value = np.asarray(x)
     if value.dtype.hasobject:
         return Same(x)
+    # A weak type promotes differently, so it makes another program of the same numbers.
     return value.shape, dtype, digest(value), getattr(x, "weak_type", False)
 
 

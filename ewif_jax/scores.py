@@ -126,6 +126,8 @@ def _of_values(score: Score) -> Score:
             gaussian.log_density(innovation, mask),
             info.log_likelihood,
         )
+        # What is not a number stays so: it says why there is no score, and the charge takes its
+        # place.
         shown = jnp.where(jnp.isfinite(info.innovation), innovation.value, info.innovation)
         some = info._replace(
             innovation=shown, innovation_cov=innovation.cov, log_likelihood=likelihood

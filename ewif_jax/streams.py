@@ -70,6 +70,8 @@ def stream(
     if np.ndim(sensor):
         checks.shape("sensor", sensor, (steps,))
     sensor = xp.broadcast_to(sensor, (steps,))
+    # Zeros in place of what is absent: a NaN behind a mask would still reach a gradient, as 0 times
+    # NaN.
     seen = xp.where(mask, value, 0)
     rows = Measurement(array(xp.asarray(time), dtype), array(seen), array(sensor), array(mask))
     if arrival is None:

@@ -61,6 +61,7 @@ def fading(
         if model.steps is None:
             return jnp.where(t1 > t0, jnp.square(alpha), 1)
         k, _ = count_steps(model.steps, t0, t1)
+        # Only forwards: against time the factor would take back what was forgotten.
         return jnp.where(k > 0, alpha, 1) ** (2 * k)
 
     return covariance_form(model, "fading", per_step)

@@ -48,6 +48,8 @@ def information(model: Model) -> Estimator:
     def move(params: Params, state: InformationState, time: Array) -> InformationState:
         Q = jnp.asarray(model.process_cov(params, state.time, time), state.mean.dtype)
         checks.shape("Q", Q, (state.mean.shape[0],) * 2)
+        # A root of Q with zero columns where Q is singular: noise enters as errors of unit variance
+        # that these columns spread, so no inverse of Q is asked for.
         return form.transport(model, params, state, time, None, cholesky.factor(Q).lower)
 
     def measure(

@@ -126,6 +126,7 @@ def _portion_of(run: OneRun, shown: PyTree, per_run: Inputs, value: Array, ahead
     draws = any(jax.tree.leaves(of_key))
     together = goes_together(run.step)
     kept = 0 if ahead else shared
+    # What all share is no part of a group's memory once it has been computed ahead.
     size = group_size(runs, own, kept, largest, value.dtype.itemsize, together, draws)
     seen = parted(run.step.outputs[1], run.seen_differs)[0]
     block = block_size(steps, size * sum(x.size * x.dtype.itemsize for x in seen), together)

@@ -43,6 +43,9 @@ def regression(differences: Array, scale: Array, centre: Array) -> Regression:
     shift = jnp.sum(differences, 1) / (2 * scale)
     around = (differences - shift[:, None]) / (2 * jnp.sqrt(scale))
     ahead, behind = around[:, :n], around[:, n:]
+    # The difference of both sides is the slope, their sum what is even in the offset: that a
+    # straight line cannot say. A linear function leaves exact zeros, so it is filtered as by
+    # `kalman`.
     bend = ahead + behind
     left_over = matmul(bend, bend.T) + centre * (shift[:, None] * shift[None, :])
     return Regression(shift, ahead - behind, left_over)
@@ -71,6 +74,8 @@ def update_by_points(
     weights = cholesky.solve(factor, D)
     gain = matmul(lower, weights.T)
     value = jnp.where(mask, difference, 0)
+    # P (I - W'D) in roots: T = L (I - W'D) is P's root after the gain, and K R K' what the gain
+    # lets in of the noise. Both are squares, so no variance can come out negative.
     left = matmul(lower, jnp.eye(mean.shape[0], dtype=mean.dtype) - matmul(weights.T, D))
     packed = symmetric.pack(matmul(left, left.T) + matmul(matmul(gain, R), gain.T))
     packed = gaussian.cleared(packed, symmetric.pack(matmul(lower, lower.T)), R, cov)

@@ -103,6 +103,7 @@ class InFolder:
             if is_half(path):
                 path.unlink()
         self.resumed = sum(1 for path in units.glob("*.npz"))
+        # A disk that is full or read-only says so now, not after hours of work.
         write_whole(units / "room", lambda half: half.write_bytes(PROBE))
         (units / "room").unlink()
         kept = sum(path.stat().st_size for path in units.glob("*.npz"))

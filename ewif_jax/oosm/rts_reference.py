@@ -90,6 +90,8 @@ def _tied_state(
         return choose(slot.time > time, _one_step_behind(model, params, tie, slot), tie), None
 
     n = state.mean.shape[0]
+    # The present is tied to itself by the identity and without error; every step back composes one
+    # more G (`_one_step_behind`).
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
     nearest, _ = lax.scan(tied_back, now, state.past)
     mean, F, Q = predict_state(model, params, start.mean, start.time, time)

@@ -121,6 +121,9 @@ def _target_flight(key: Array, q: float, length: float) -> Array:
     steps = math.ceil(length / FINE) + 1
     push, slip = jax.random.normal(key, (2, steps, 2))
     gained = math.sqrt(q * FINE) * push
+    # The position gained by white acceleration is half of what the velocity gains times the step,
+    # plus a part that is independent of it with variance q dt^3 / 12: both together have the exact
+    # covariance of the integrals.
     moved = FINE / 2 * gained + math.sqrt(q * FINE**3 / 12) * slip
     start = jnp.asarray(START)[None]
     velocity = start[:, 2:] + _from_zero(gained)

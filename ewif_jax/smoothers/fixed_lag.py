@@ -81,6 +81,8 @@ def fixed_lag(model: Model, lag: int) -> Estimator:
     def measure_newest(
         params: Params, state: LagState, measurement: Measurement
     ) -> tuple[LagState, Info]:
+        # The sensor sees the newest state alone; the others move through what they have in common
+        # with it, which is the joint covariance.
         flat, older = state.mean.ravel(), state.mean[1:].size
         mean, cov, info = measure(model, params, flat, state.cov, measurement, older)
         return state._replace(mean=mean.reshape(state.mean.shape), cov=cov), info

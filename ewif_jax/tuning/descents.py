@@ -140,6 +140,8 @@ def by_optimizer(
         elif best is None:
             return Ended("not finite", nowhere, True)
         else:
+            # The optimizer's state goes back too, not the point alone: momentum that led out of the
+            # domain would lead there again.
             refused, scale, last = True, scale / 2, best
         assert last is not None
         key = None if pricer.key is None else jax.random.fold_in(pricer.key, turn)

@@ -112,6 +112,8 @@ def found_domain(
         refuses: whether the loss refuses known parameters.
     """
     leaves, notes = [jnp.asarray(x) for x in start], []
+    # The loss is asked whether it takes the other sign: the sign of a start says nothing (a bias
+    # may start at 1 and end at -3; docs/decisions/tuning.md: "The domain is found, not guessed").
     flipped = [_replaced_leaf(leaves, k, _sign_flipped(x)) for k, x in enumerate(leaves)]
     unsure = [k for k, t in enumerate(given) if t is None and leaves[k].size]
     refused = {k: refuses(flipped[k]) for k in unsure}
@@ -164,6 +166,7 @@ def _one_sided(x: Numbers) -> Transform:
 
 def _sign_flipped(x: Numbers) -> Any:
     scale = jnp.max(jnp.abs(x))
+    # A zero has no other sign: it is moved a little below zero, in the scale of its leaf.
     return jnp.where(x == 0, -FRACTION * jnp.where(scale > 0, scale, 1), -x)
 
 
@@ -176,6 +179,7 @@ def _lifted_zeros(leaves: Leaves, k: int, pricer: Pricer) -> Any:
     leaf = leaves[k]
     scale = float(jnp.max(leaf)) or 1.0
     before = pricer.value(leaves)
+    # Lower by more than rounding: otherwise any value so small that nothing changes would do.
     margin = 10 * float(jnp.finfo(leaf.dtype).eps) * (abs(before) if np.isfinite(before) else 0)
     for power in range(FIRST_TRIED, LAST_TRIED + 1):
         tried = jnp.where(leaf == 0, jnp.asarray(scale * 10.0**power, leaf.dtype), leaf)

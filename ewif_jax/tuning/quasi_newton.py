@@ -93,6 +93,8 @@ def _descent_result(
 ) -> Generator[np.ndarray, tuple[float, np.ndarray], tuple[SeenPoint, str, bool]]:
     """The end of one descent, why it ended, and whether a step was refused as not finite."""
     n, refused, fresh, earlier = len(seen.point), False, 0, seen.value
+    # A first step of length 1 along the gradient: in logarithms a factor e, whatever the loss is
+    # measured in.
     curvature, radius = np.eye(n) * np.linalg.norm(seen.gradient), 1.0
     while True:
         # A least value of 0 is approached in relation to how far it has just fallen.

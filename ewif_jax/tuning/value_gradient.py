@@ -41,6 +41,8 @@ def value_and_gradient(loss: Loss, params: Params, *rest: Any) -> tuple[Array, A
     if flat.size == 1:
         value, slope = jax.jvp(loss_of_vector, (flat,), (jnp.ones_like(flat),))
         return value, unflatten(slope[None])
+    # Directions in pairs, an odd one beside a row of zeros, whose slope is cut off: one program for
+    # all pairs (`fast/slopes.py` says why pairs).
     directions = jnp.eye(flat.size + flat.size % 2, flat.size, dtype=flat.dtype)
     values, slopes = lax.map(along, directions.reshape(-1, 2, flat.size))
     return values[0], unflatten(slopes.reshape(-1)[: flat.size])
