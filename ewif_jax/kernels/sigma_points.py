@@ -44,8 +44,7 @@ def regression(differences: Array, scale: Array, centre: Array) -> Regression:
     around = (differences - shift[:, None]) / (2 * jnp.sqrt(scale))
     ahead, behind = around[:, :n], around[:, n:]
     # The difference of both sides is the slope, their sum what is even in the offset: that a
-    # straight line cannot say. A linear function leaves exact zeros, so it is filtered as by
-    # `kalman`.
+    # straight line cannot say. A linear function leaves nothing over.
     bend = ahead + behind
     left_over = matmul(bend, bend.T) + centre * (shift[:, None] * shift[None, :])
     return Regression(shift, ahead - behind, left_over)
