@@ -153,7 +153,7 @@ def check_runs(
             validated(estimator, params, measurements, start, t0, times, clock, key)
 
         try:
-            filter_one(own)
+            validated(estimator, own, measurements, start, t0, times, clock, key)
         except (TypeError, ValueError) as error:
             _name_forgotten(error, own, params_f, runs, filter_one)
             raise
