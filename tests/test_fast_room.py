@@ -12,7 +12,7 @@ import pytest
 
 import ewif_jax as ej
 from ewif_jax import checks
-from ewif_jax.fast import memo
+from ewif_jax.fast import compiling, memo
 from ewif_jax.fast.memo import Memo, once, question_of, remembered
 
 ROOM = Path(memo.__file__).parent
@@ -178,3 +178,17 @@ def test_the_memo_keeps_neither_parameters_nor_functions(entry):
     jax.clear_caches()
     gc.collect()
     assert [was() is None for was in gone] == [True, True]
+
+
+def test_options_that_xla_does_not_know_are_left_out_one_by_one(monkeypatch):
+    """Another XLA knows others: what it does not know must not cost the rest, or the call."""
+    unknown = dict.fromkeys(("xla_cpu_not_yet_thought_of", "xla_cpu_dropped_long_ago"), True)
+    before = compiling._known()
+    monkeypatch.setattr(compiling, "QUICKEST", {**unknown, **compiling.QUICKEST})
+    compiling._known.cache_clear()
+    try:
+        assert compiling._known() == before
+        quick = compiling.quick_jit(lambda x: x + 1, (), compiling.QUICKEST)
+        assert quick(jnp.float32(1.0)) == 2.0
+    finally:
+        compiling._known.cache_clear()

@@ -72,6 +72,6 @@ def unscented(
 
     def estimate(params: Params, state: CovarianceState) -> Gaussian:
         del params
-        return Gaussian(state.mean, symmetric.unpack(state.cov))
+        return Gaussian(state.mean, symmetric.unpack(symmetric.no_negative(state.cov)))
 
     return estimator_from(Recursion("unscented", start, move, measure, estimate, model=model))

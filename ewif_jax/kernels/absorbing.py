@@ -73,7 +73,7 @@ def _one_absorbed(
         )
         leads.append(lead)
         if k < n - 1:
-            equation, scale = stage(_left, row, equation[1:], scale[1:], lead, batch=batch)
+            equation, scale = stage(_left, row, equation[1:], scale, lead, batch=batch)
             rests.append(equation)
     lead, noise = stacked(leads), stacked(noises)
     kept, steps = stage(_learnt, variances, finite, noise, lead, batch=batch)
@@ -105,8 +105,8 @@ def _met(n: int) -> Callable[..., tuple[Array, Array]]:
 
 @kept_apart
 def _left(row: Array, rest: Array, scale: Array, lead: Array) -> tuple[Array, Array]:
-    part = lead[None] * row
-    return rest - part, jnp.maximum(scale, jnp.abs(part))
+    # The rounding of the lead, however little of it is left, is in all that it takes out.
+    return rest - lead[None] * row, jnp.maximum(scale[1:], scale[0][None] * jnp.abs(row))
 
 
 @kept_apart

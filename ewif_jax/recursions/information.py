@@ -310,7 +310,7 @@ def _info(
     used = is_determined & jnp.any(mask) & good
     return Info(
         jnp.where(is_determined | ~mask, innovation.value, jnp.nan),
-        jnp.where(is_determined, innovation.cov, jnp.nan),
+        jnp.where(is_determined | ~(mask[:, None] & mask[None]), innovation.cov, jnp.nan),
         jnp.where(used, gaussian.log_density(innovation, mask), 0),
         state.time - measurement.time,
         jnp.where(good, jnp.int32(Status.USED), jnp.int32(Status.REJECTED)),

@@ -14,8 +14,9 @@ EXACT_LATE = {"replay", "asd"}
 ONE_LATE = {"rts_reference"}
 ONE_STEP = {"a1", "b1", "al1", "bl1", "selective"}
 WEIGHTED = {"ewif", "drop_late"}
-MAY_FORGET = WEIGHTED | {"limited_memory", "fixed_lag_ewif"}
-"""Whose docstrings say that after a long gap nothing is known: NaN."""
+MAY_FORGET = WEIGHTED | {"ewif_bank", "limited_memory", "fixed_lag_ewif"}
+"""Whose docstrings say that after a long gap nothing is known: NaN, and no innovation of what is
+measured then."""
 
 
 def broken_invariant(name: str, given: Problem, trace: ej.Trace) -> str:
@@ -50,8 +51,11 @@ def broken_invariant(name: str, given: Problem, trace: ej.Trace) -> str:
     defined = np.isfinite(trace.mean).all(1) & np.isfinite(trace.cov).all((1, 2))
     if (used & ~defined).any() and name not in MAY_FORGET:
         return f"NaN with status USED at {np.flatnonzero(used & ~defined)[0]}"
-    if np.isnan(info.log_likelihood).any() or np.isnan(info.innovation).any():
-        return "NaN in Info"
+    if np.isnan(info.log_likelihood).any():
+        return "NaN likelihood"
+    unknown = np.isnan(info.innovation).any(1)
+    if (unknown & (info.log_likelihood != 0)).any() or (unknown.any() and name not in MAY_FORGET):
+        return "NaN innovation"
     size = np.sqrt(np.maximum(variances, np.finfo(time.dtype).tiny))
     scaled = np.where(defined[:, None, None], trace.cov, 0) / (size[:, :, None] * size[:, None, :])
     if np.abs(scaled - scaled.swapaxes(1, 2)).max() > 1e-6:

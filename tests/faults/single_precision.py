@@ -125,6 +125,10 @@ def compared(row: Row, world: World, steps: int) -> Found:
             error.max(), max(beyond.max(), 0.0), np.abs(ratio - 1).max(), variance.min(), lost
         )
     other = estimates(estimator, world, steps, np.float64, keys[1])[0][both]
+    spread_out = (sd > 0).all(1)
+    if spread_out.mean() < 0.5:  # all members are one: there is no sigma to compare with
+        return Found(np.nan, 0.0, np.nan, variance.min(), lost)
+    error, ratio, other, mean, sd = (x[spread_out] for x in (error, ratio, other, mean, sd))
     usual = np.sqrt(np.mean(np.square((other - mean) / sd)))
     found = np.sqrt(np.mean(np.square(error)))
     return Found(found / usual, 0.0, abs(np.exp(np.mean(np.log(ratio))) - 1), variance.min(), lost)
@@ -156,6 +160,9 @@ def cell(row: Row, world: World, steps: int) -> str:
     held = 1.1 if row.needs_key else world.target
     error = found.worst if row.needs_key else found.beyond
     marks = "" if error <= held and found.least >= 0 and not found.lost else " **!**"
+    if row.needs_key and np.isnan(found.worst):
+        marks = "" if found.least >= 0 and not found.lost else " **!**"
+        return f"no spread left{marks}"
     if row.needs_key:
         return f"{found.worst:.2f} times{marks}"
     beyond = f", {found.beyond:.1g} beyond" if found.beyond else ""

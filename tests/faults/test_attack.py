@@ -32,6 +32,25 @@ def test_inputs_of_other_kinds_mean_what_they_say_or_are_refused():
     assert not listed([*every, *drawn])
 
 
+WERE_WRONG = {
+    "rounding of rows after an exact measurement": (
+        attack_filters.attack_entries_agree, "information", 3, attack.SMALL,
+    ),
+    "a variance that motion made negative": (
+        attack_filters.attack_values, "unscented", 43, attack.SMALL, np.float64,
+    ),
+    "masked while nothing is known": (
+        attack_filters.attack_values, "limited_memory", 2, attack.SMALL, np.float32,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", WERE_WRONG)
+def test_what_was_wrong_once(kind):
+    attempt, *arguments = WERE_WRONG[kind]
+    assert not listed([(kind, attempt(*arguments))])
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
