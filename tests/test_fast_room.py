@@ -183,12 +183,12 @@ def test_the_memo_keeps_neither_parameters_nor_functions(entry):
 def test_options_that_xla_does_not_know_are_left_out_one_by_one(monkeypatch):
     """Another XLA knows others: what it does not know must not cost the rest, or the call."""
     unknown = dict.fromkeys(("xla_cpu_not_yet_thought_of", "xla_cpu_dropped_long_ago"), True)
-    before = compiling._known()
+    before = compiling._known_options()
     monkeypatch.setattr(compiling, "QUICKEST", {**unknown, **compiling.QUICKEST})
-    compiling._known.cache_clear()
+    compiling._known_options.cache_clear()
     try:
-        assert compiling._known() == before
+        assert compiling._known_options() == before
         quick = compiling.quick_jit(lambda x: x + 1, (), compiling.QUICKEST)
         assert quick(jnp.float32(1.0)) == 2.0
     finally:
-        compiling._known.cache_clear()
+        compiling._known_options.cache_clear()
