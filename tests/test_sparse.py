@@ -1,7 +1,5 @@
 """Products that leave out known zeros are the dense products, and models know their zeros."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +7,8 @@ import pytest
 
 import ewif_jax as ej
 from ewif_jax.fast.small import matmul, matvec
-from ewif_jax.fast.sparse import pattern
+from ewif_jax.fast.sparse import Matrix, pattern, with_zeros
 from ewif_jax.kernels import symmetric
-from ewif_jax.models import patterns
 
 RUNS, N = 5, 4
 RNG = np.random.default_rng(0)
@@ -35,34 +32,48 @@ def test_products_are_the_dense_ones(name, per_run):
     where = pattern(flags)
     a = RNG.normal(size=(RUNS, N, N)) * flags
     a = a if per_run else a[0]
-    cov, plus, x = random_cov(RNG), random_cov(RNG), RNG.normal(size=(RUNS, N))
+    cov, x = random_cov(RNG), RNG.normal(size=(RUNS, N))
 
-    def all_of(a, cov, plus, x):
+    def all_of(a, cov, x):
         packed = symmetric.pack(cov)
-        moved = symmetric.congruence(a, packed, where)
-        added = symmetric.propagated(a, packed, symmetric.pack(plus), jnp.asarray(True), where)
+        moved = symmetric.congruence(Matrix(a, where), packed)
         return (
             symmetric.unpack(moved),
-            symmetric.unpack(added),
-            symmetric.rows(a[:2], packed, where[:2]),
-            matvec(a, x, where),
-            matmul(a, cov, where),
+            symmetric.rows(Matrix(a[:2], where[:2]), packed),
+            matvec(Matrix(a, where), x),
+            matmul(Matrix(a, where), cov),
+            matmul(cov, Matrix(a, where).T),
         )
 
-    found = jax.jit(jax.vmap(all_of, (0 if per_run else None, 0, 0, 0)))(a, cov, plus, x)
-    moved = a @ cov @ np.swapaxes(a, -1, -2)
-    wanted = moved, moved + plus, a[..., :2, :] @ cov, (a @ x[..., None])[..., 0], a @ cov
-    one = jax.jit(all_of)(a[0] if per_run else a, cov[0], plus[0], x[0])
+    found = jax.jit(jax.vmap(all_of, (0 if per_run else None, 0, 0)))(a, cov, x)
+    turned = np.swapaxes(a, -1, -2)
+    wanted = (
+        a @ cov @ turned,
+        a[..., :2, :] @ cov,
+        (a @ x[..., None])[..., 0],
+        a @ cov,
+        cov @ turned,
+    )
+    one = jax.jit(all_of)(a[0] if per_run else a, cov[0], x[0])
     for got, alone, exact in zip(found, one, wanted, strict=True):
         np.testing.assert_allclose(got, exact, atol=1e-12)
         np.testing.assert_allclose(alone, exact[0], atol=1e-12)
 
 
-def test_what_is_not_known_is_not_a_number():
-    packed = symmetric.pack(jnp.eye(N))
-    moved = partial(symmetric.propagated, jnp.eye(N), packed, packed)
-    assert np.isnan(moved(jnp.asarray(False))).all()
-    np.testing.assert_array_equal(moved(jnp.asarray(True)), 2 * packed)
+def test_a_matrix_is_its_values_elsewhere():
+    flags = PATTERNS["two chains"]
+    values = jnp.asarray(RNG.normal(size=(N, N)) * flags)
+    a = with_zeros(values, pattern(flags))
+    assert with_zeros(values, None) is values
+    assert isinstance(a, Matrix)
+    assert a.shape == (N, N)
+    assert a.dtype == values.dtype
+    np.testing.assert_array_equal(np.asarray(a), values)
+    np.testing.assert_array_equal(jnp.where(True, a, 0), values)
+    np.testing.assert_array_equal(a @ values, values @ values)
+    np.testing.assert_array_equal(values @ a.T, values @ values.T)
+    again = jax.jit(lambda a: a)(a)  # a pytree, whose zeros are known to the program
+    assert again.where == a.where
 
 
 @pytest.mark.parametrize("per_run", [False, True], ids=["shared", "per_run"])
@@ -73,7 +84,11 @@ def test_gradients_are_those_of_the_dense_product(per_run):
 
     def loss(where, a, cov):
         packed = jax.vmap(symmetric.pack)(cov)
-        run = jax.vmap(partial(symmetric.congruence, where=where), (0 if per_run else None, 0))
+
+        def moved(a, packed):
+            return symmetric.congruence(with_zeros(a, where), packed)
+
+        run = jax.vmap(moved, (0 if per_run else None, 0))
         return jnp.sum(jnp.sin(run(a, packed)))
 
     for derivative in (jax.jacrev, jax.jacfwd):
@@ -102,7 +117,7 @@ MODELS = {
 def test_no_model_hides_an_element(name):
     """F in both directions of time and H of every sensor are zero wherever the pattern says so."""
     model = MODELS[name]
-    F_where, H_where = patterns(model)
+    F_where, H_where = model.linear.F_where, model.linear.H_where
     assert F_where is not None
     assert H_where is not None
     for t1 in (-1.3, 0.0, 0.7):
@@ -115,7 +130,7 @@ def test_no_model_hides_an_element(name):
 
 def test_of_a_function_nothing_is_known():
     model = ej.linear_model(lambda p, t0, t1: jnp.eye(2), lambda p, s, t: jnp.eye(2), np.eye(2))
-    assert patterns(model) == (None, None)
+    assert (model.linear.F_where, model.linear.H_where) == (None, None)
 
 
 def test_a_complete_stream_need_not_say_so():

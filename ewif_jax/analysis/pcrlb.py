@@ -10,6 +10,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.analysis.crlb import check_finite_information
 from ewif_jax.fast.small import matmul
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, predict_measurement, predict_state
@@ -251,6 +252,7 @@ def _moved_bound(
     _, F, Q = jax.vmap(lambda x: predict_state(model, params, x, t0, t1), out_axes=(0, 0, None))(
         states
     )
+    F = dense(F)
     mean = F.mean(0)
     root = cholesky.factor(Q)
     apart = jax.vmap(lambda F: cholesky.forward(root, F - mean))(F)
@@ -265,7 +267,7 @@ def _expected_information(
 
     def one_state(x: Array) -> Array:
         _, H, R = predict_measurement(model, params, x, measurement.sensor, measurement.time)
-        return _measured_information(H, R, measurement.mask)
+        return _measured_information(dense(H), R, measurement.mask)
 
     return jax.vmap(one_state)(states).mean(0)
 

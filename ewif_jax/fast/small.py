@@ -17,19 +17,22 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from ewif_jax.fast.batched import contiguous, kernel, stage, total
-from ewif_jax.fast.sparse import Pattern, multiplied, product
+from ewif_jax.fast.sparse import Matrix, Pattern, apart, dense, multiplied, product
 
 
-def matmul(a: Array, b: Array, where: Pattern | None = None) -> Array:
-    """`a @ b` for two matrices, of which a may differ from zero `where`; under `vmap` the result is
+def matmul(a: Array | Matrix, b: Array | Matrix) -> Array:
+    """`a @ b` for two matrices, without the zeros that a carries; under `vmap` the result is
     batched along its last axis."""
-    return _matmul_p.bind(a, b) if where is None else _sparse_product(where)(a, b)
+    values, where = apart(a)
+    if where is None:
+        return _matmul_p.bind(values, dense(b))
+    return _sparse_product(where)(values, dense(b))
 
 
-def matvec(a: Array, x: Array, where: Pattern | None = None) -> Array:
-    """`a @ x` for a matrix, which may differ from zero `where`, and a vector, with the batching of
-    `matmul`."""
-    return matmul(a, x[:, None])[:, 0] if where is None else _sparse_product(where)(a, x)
+def matvec(a: Array | Matrix, x: Array) -> Array:
+    """`a @ x` for a matrix and a vector, as `matmul`."""
+    values, where = apart(a)
+    return matmul(values, x[:, None])[:, 0] if where is None else _sparse_product(where)(values, x)
 
 
 @cache

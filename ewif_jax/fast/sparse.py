@@ -1,8 +1,11 @@
 """Small matrices whose zeros are known before anything runs: what is zero is not multiplied."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -19,9 +22,64 @@ def pattern(*matrices: np.ndarray) -> Pattern:
     return tuple(tuple(bool(x) for x in row) for row in anywhere)
 
 
-def transposed(where: Pattern | None) -> Pattern | None:
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Matrix:
+    """A small matrix that carries where it may differ from zero: products of `fast.small` and
+    `kernels.symmetric` with it from the left leave the rest out. Everywhere else it is its
+    `values`."""
+
+    values: Array
+    where: Pattern = field(metadata={"static": True})
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, columns)."""
+        return self.values.shape
+
+    @property
+    def dtype(self) -> Any:
+        """That of the values."""
+        return self.values.dtype
+
+    @property
+    def T(self) -> "Matrix":
+        """The transpose."""
+        return Matrix(self.values.T, transposed(self.where))
+
+    def __matmul__(self, other: Any) -> Array:
+        return self.values @ jnp.asarray(other)
+
+    def __jax_array__(self) -> Array:
+        return self.values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.values, dtype)
+
+
+def with_zeros(values: Array, where: Pattern | None) -> Array | Matrix:
+    """The matrix with the zeros that are known, if any are."""
+    return values if where is None else Matrix(values, where)
+
+
+def apart(a: Array | Matrix) -> tuple[Array, Pattern | None]:
+    """Values, and where they may differ from zero, if that is known."""
+    return (a.values, a.where) if isinstance(a, Matrix) else (a, None)
+
+
+def dense(a: Array | Matrix) -> Array:
+    """The values alone."""
+    return apart(a)[0]
+
+
+def elementwise(fn: Callable[[Array], Array], a: Array | Matrix) -> Any:
+    """`fn` of the values, for a function that leaves zeros where they are."""
+    return replace(a, values=fn(a.values)) if isinstance(a, Matrix) else fn(a)
+
+
+def transposed(where: Pattern) -> Pattern:
     """The pattern of the transpose."""
-    return None if where is None else tuple(zip(*where, strict=True))
+    return tuple(zip(*where, strict=True))
 
 
 class Terms(NamedTuple):

@@ -11,13 +11,14 @@ Gram-Schmidt. The rows are kept one after the other without zeros and ones: n (n
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
+from typing import TypeGuard
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from ewif_jax.fast.batched import kernel, stacked, stage, total
-from ewif_jax.fast.sparse import Pattern, by_row
+from ewif_jax.fast.sparse import Matrix, Pattern, apart, by_row
 from ewif_jax.kernels import cholesky
 from ewif_jax.types import DTypeLike
 
@@ -52,14 +53,15 @@ def of_covariance(cov: Array) -> tuple[Array, Array]:
     return _of_covariance(cov)
 
 
-def carried(rows: Array, back: Array, where: Pattern) -> tuple[Array, Array]:
-    """Rows after x <- back x' for an upper triangular matrix `back` that may differ from zero
-    `where`, and the diagonal (n,) of back, by which the targets have to be divided."""
-    return _carried(where)(rows, back)
+def carried(rows: Array, back: Matrix) -> tuple[Array, Array]:
+    """Rows after x <- back x' for an upper triangular matrix `back`, and its diagonal (n,), by
+    which the targets have to be divided."""
+    return _carried(back.where)(rows, back.values)
 
 
-def is_upper(where: Pattern | None) -> bool:
-    """Whether a pattern is known to be upper triangular."""
+def is_upper(matrix: Array | Matrix) -> TypeGuard[Matrix]:
+    """Whether a matrix is known to be upper triangular."""
+    where = apart(matrix)[1]
     return where is not None and not np.tril(np.asarray(where, bool), -1).any()
 
 

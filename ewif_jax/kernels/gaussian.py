@@ -10,7 +10,16 @@ from jax import Array, lax
 
 from ewif_jax.fast.batched import kernel, total
 from ewif_jax.fast.small import matmul
-from ewif_jax.fast.sparse import Pattern, by_row, full, multiplied
+from ewif_jax.fast.sparse import (
+    Matrix,
+    Pattern,
+    apart,
+    by_row,
+    dense,
+    elementwise,
+    full,
+    multiplied,
+)
 from ewif_jax.kernels import cholesky, symmetric
 
 
@@ -64,32 +73,32 @@ def update(
     mean: Array,
     packed: Array,
     difference: Array,
-    H: Array,
+    H: Array | Matrix,
     R: Array,
     mask: Array,
-    H_where: Pattern | None = None,
 ) -> tuple[Array, Array, Innovation]:
     """Mean and packed covariance after a linear(ised) measurement, with the innovation.
 
-    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,); H may differ from
-    zero `H_where`. The covariance is
+    `difference` (m,) is measured minus predicted, H (m, n), R (m, m), mask (m,). The covariance is
     (I - K H) P (I - K H)' + K R K' in two low-rank steps. The second uses H applied to the rounded
     result of the first, which is what makes the Joseph form forget rounding errors of the gain.
     What P itself was rounded by it cannot forget: where that exceeds a variance that is left (a
     prior 1/eps times as wide as R), the variance is 0, never negative. So is one that an exact
     measurement leaves: its rounding would be weighed like knowledge by the next such measurement.
     """
-    H, R = jnp.where(mask[:, None], H, 0), mask_cov(R, mask)
-    cross = symmetric.rows(H, packed, H_where)
-    cov = _expected_cov(H_where)(cross, H, R)
-    factor = cholesky.factor(cov, size=sizes(packed, H, R, H_where))
+    H = elementwise(lambda H: jnp.where(mask[:, None], H, 0), H)
+    R = mask_cov(R, mask)
+    cross = symmetric.rows(H, packed)
+    values, where = apart(H)
+    cov = _expected_cov(where)(cross, values, R)
+    factor = cholesky.factor(cov, size=sizes(packed, H, R))
     innovation = Innovation(jnp.where(mask, difference, 0), cov, factor, cross)
     weights = cholesky.solve(innovation.factor, cross)
     mean = _moved_mean(mean, weights, innovation.value)
     # P - P H' K' first, then + K (R K' - H half): the same as Joseph's product, but two low-rank
     # steps on the triangle in place of two n x n products.
     half = _packed_less(packed, cross, weights)
-    left_over = _left_over(R, weights, symmetric.rows(H, half, H_where))
+    left_over = _left_over(R, weights, symmetric.rows(H, half))
     least = _least_share(mean.shape[0])(R, cov)
     return mean, _packed_more(packed, half, weights, left_over, least), innovation
 
@@ -99,12 +108,13 @@ def rounding_of(predicted: Array) -> Array:
     return 64 * jnp.finfo(predicted.dtype).eps * jnp.abs(predicted)
 
 
-def sizes(packed: Array, H: Array, R: Array, H_where: Pattern | None = None) -> Array | None:
+def sizes(packed: Array, H: Array | Matrix, R: Array) -> Array | None:
     """R_kk plus n times the sum of H_ki^2 P_ii, (m,): how large the terms are, together, that may
     cancel in H P H' + R. None where there is one term only. H and R are masked."""
-    if H_where is not None and max(map(sum, H_where)) <= 1:
+    where = apart(H)[1]
+    if where is not None and max(map(sum, where)) <= 1:
         return None
-    return _term_sizes(packed, H, R)
+    return _term_sizes(packed, dense(H), R)
 
 
 @kernel

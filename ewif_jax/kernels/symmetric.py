@@ -13,7 +13,7 @@ from jax import Array, lax
 
 from ewif_jax.fast.batched import kernel, linear_kernel, smallest, stage, total
 from ewif_jax.fast.small import matvec
-from ewif_jax.fast.sparse import Pattern, by_row, full, multiplied
+from ewif_jax.fast.sparse import Matrix, Pattern, apart, by_row, full, multiplied
 
 
 def order(packed: Array) -> int:
@@ -72,19 +72,13 @@ def unpack(packed: Array) -> Array:
     return _unpack(packed)
 
 
-def congruence(a: Array, packed: Array, where: Pattern | None = None) -> Array:
-    """a P a' for a square matrix a and a packed P, packed; `where` a may differ from zero.
+def congruence(a: Array | Matrix, packed: Array) -> Array:
+    """a P a' for a square matrix a and a packed P, packed.
 
     A dense matrix a that the batch shares is one product with its second power.
     """
-    return _congruence_kernel(where)(a, packed)
-
-
-def propagated(
-    a: Array, packed: Array, plus: Array, is_defined: Array, where: Pattern | None = None
-) -> Array:
-    """a P a' + plus, packed, NaN unless `is_defined` ()."""
-    return _propagated_kernel(where)(a, packed, plus, is_defined)
+    values, where = apart(a)
+    return _congruence_kernel(where)(values, packed)
 
 
 def no_negative(packed: Array) -> Array:
@@ -92,9 +86,10 @@ def no_negative(packed: Array) -> Array:
     return _no_negative(packed)
 
 
-def rows(a: Array, packed: Array, where: Pattern | None = None) -> Array:
-    """a P (m, n) for a matrix a (m, n) and a packed P; `where` a may differ from zero."""
-    return _rows_kernel(where)(a, packed)
+def rows(a: Array | Matrix, packed: Array) -> Array:
+    """a P (m, n) for a matrix a (m, n) and a packed P."""
+    values, where = apart(a)
+    return _rows_kernel(where)(values, packed)
 
 
 def times(packed: Array, x: Array) -> Array:
@@ -247,15 +242,6 @@ def _rows_kernel(where: Pattern | None) -> Callable[[Array, Array], Array]:
 @cache
 def _congruence_kernel(where: Pattern | None) -> Callable[[Array, Array], Array]:
     return kernel(lambda a, packed: _moved_packed(a, packed, where))
-
-
-@cache
-def _propagated_kernel(where: Pattern | None) -> Callable[..., Array]:
-    @kernel
-    def moved(a: Array, packed: Array, plus: Array, is_defined: Array) -> Array:
-        return jnp.where(is_defined[None], _moved_packed(a, packed, where) + plus, jnp.nan)
-
-    return moved
 
 
 @cache

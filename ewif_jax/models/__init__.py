@@ -10,7 +10,6 @@ from ewif_jax.models.kinematic import (
 from ewif_jax.models.linearise import (
     affine_flow,
     observation,
-    patterns,
     predict_measurement,
     predict_state,
     size,
@@ -31,7 +30,6 @@ __all__ = [
     "from_continuous",
     "linear_model",
     "observation",
-    "patterns",
     "position_sensor",
     "predict_measurement",
     "predict_state",

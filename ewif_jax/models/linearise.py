@@ -7,7 +7,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matvec
-from ewif_jax.fast.sparse import Pattern
+from ewif_jax.fast.sparse import Matrix, with_zeros
 from ewif_jax.models.model import Linear, Model, affine
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.types import DTypeLike, Numbers, Params
@@ -15,13 +15,13 @@ from ewif_jax.types import DTypeLike, Numbers, Params
 
 def predict_state(
     model: Model, params: Params, x: Array, t0: Array, t1: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array | Matrix, Array]:
     """x at t1 (n,), the Jacobian F (n, n) of the motion at x, and Q (n, n) for t1 >= t0."""
     Q = jnp.asarray(model.process_cov(params, t0, t1), x.dtype)
     if model.linear is not None:
         F, c = affine_flow(model, params, t0, t1, x.dtype)
         checks.shape("F", F, (x.shape[0],) * 2)
-        moved = matvec(F, x, model.linear.F_where)
+        moved = matvec(F, x)
         return (moved if c is None else moved + c), F, Q
 
     def move(x: Array) -> Array:
@@ -34,15 +34,17 @@ def predict_state(
 
 def predict_measurement(
     model: Model, params: Params, x: Array, sensor: Array, t: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array | Matrix, Array]:
     """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
     check_sensor(model, params, x, sensor, t)
     R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
     if model.linear is not None:
-        H = jnp.asarray(model.linear.H(params, sensor, t), x.dtype)
+        H = with_zeros(
+            jnp.asarray(model.linear.H(params, sensor, t), x.dtype), model.linear.H_where
+        )
         checks.shape("H", H, ("m", x.shape[0]))
         checks.shape("R", R, (H.shape[0],) * 2)
-        return matvec(H, x, model.linear.H_where), H, R
+        return matvec(H, x), H, R
 
     def see(x: Array) -> Array:
         return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
@@ -54,28 +56,24 @@ def predict_measurement(
 
 def affine_flow(
     model: Model, params: Params, t0: Array, t1: Array, dtype: DTypeLike
-) -> tuple[Array, Array | None]:
+) -> tuple[Array | Matrix, Array | None]:
     """F (n, n) and c (n,) or None of a linear model: x(t1) = F x(t0) + c, in either direction.
 
     Against time c is derived from the forward input: c(t1, t0) = -F(t1, t0) b(t0, t1).
     """
     linear = need_linear(model, "this operation")
-    return affine(linear.F, linear.b, params, t0, t1, dtype)
+    F, c = affine(linear.F, linear.b, params, t0, t1, dtype)
+    return with_zeros(F, linear.F_where), c
 
 
 def observation(
     model: Model, params: Params, sensor: Array, t: Array, dtype: DTypeLike
-) -> tuple[Array, Array]:
+) -> tuple[Array | Matrix, Array]:
     """H (m, n) and R (m, m) of a linear model."""
     linear = need_linear(model, "this operation")
     check_sensor(model, params, None, sensor, t)
-    H = jnp.asarray(linear.H(params, sensor, t), dtype)
+    H = with_zeros(jnp.asarray(linear.H(params, sensor, t), dtype), linear.H_where)
     return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
-
-
-def patterns(model: Model) -> tuple[Pattern | None, Pattern | None]:
-    """Where F and H of a model may differ from zero, if that is known."""
-    return (None, None) if model.linear is None else (model.linear.F_where, model.linear.H_where)
 
 
 def size(model: Model, params: Params, t0: Numbers) -> int:

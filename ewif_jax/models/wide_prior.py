@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
+from ewif_jax.fast.sparse import dense
 from ewif_jax.models.linearise import predict_measurement, predict_state
 from ewif_jax.models.model import Model
 from ewif_jax.types import DTypeLike, Gaussian, Measurement, Numbers, Params
@@ -77,7 +78,7 @@ def _matrices_along(
         before, time, sensor = given
         mean, F, Q = predict_state(model, params, mean, before, time)
         _, H, R = predict_measurement(model, params, mean, sensor, time)
-        return mean, (F, Q, H, R)
+        return mean, (dense(F), Q, dense(H), R)
 
     return jax.lax.scan(row, mean, (start, end, sensors))[1]
 

@@ -10,9 +10,10 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast import slots
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian, symmetric, window
 from ewif_jax.kernels.trees import choose, copies
-from ewif_jax.models import Model, patterns, predict_state
+from ewif_jax.models import Model, predict_state
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, info_of, sound
@@ -94,7 +95,7 @@ def asd(model: Model, lag: int) -> Estimator:
 
     def move(params: Params, state: WindowState, time: Array) -> WindowState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
-        cov = symmetric.congruence(F, state.cov, patterns(model)[0]) + symmetric.pack(Q)
+        cov = symmetric.congruence(F, state.cov) + symmetric.pack(Q)
         return state._replace(time=time, mean=mean, cov=cov, F=matmul(F, state.F))
 
     def is_after_oldest(params: Params, state: WindowState, time: Array) -> Array:
@@ -115,7 +116,7 @@ def asd(model: Model, lag: int) -> Estimator:
             linearised_at = mean + symmetric.times(cov, window.force(state.kept, first, after))
         seen = compared(model, params, linearised_at, measurement)
         (difference, H, R, mask), accepted = sound(model, cov, seen)
-        H, R = jnp.where(mask[:, None], H, 0), gaussian.mask_cov(R, mask)
+        H, R = jnp.where(mask[:, None], dense(H), 0), gaussian.mask_cov(R, mask)
         # The line through h at the smoothed mean, seen from the filter's own mean of that time:
         # what passes the later measurements below is relative to the latter.
         difference = jnp.where(mask, difference + matvec(H, linearised_at - mean), 0)
@@ -171,11 +172,11 @@ def _split_at(
     # not have.
     time = jnp.clip(time, start, state.time)
     mean, F, Q = predict_state(model, params, mean, start, time)
-    cov = symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
+    cov = symmetric.congruence(F, cov) + symmetric.pack(Q)
     mean, cov, F = choose(
-        time < state.time, (mean, cov, F), (state.mean, state.cov, state.F)
+        time < state.time, (mean, cov, dense(F)), (state.mean, state.cov, state.F)
     )  # in sequence exactly what the filter has
-    return mean, cov, F, predict_state(model, params, mean, time, end)[1]
+    return mean, cov, F, dense(predict_state(model, params, mean, time, end)[1])
 
 
 def _solved_innovation(innovation: gaussian.Innovation) -> tuple[Array, Array, Array]:

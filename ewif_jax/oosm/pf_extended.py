@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matvec
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import copies
@@ -157,7 +158,7 @@ def _drawn_between(
     def draw(x: Array, target: Array, normals: Array) -> Array:
         there, _, Q_before = predict_state(model, params, x, start, time)
         arrived, F, Q_after = predict_state(model, params, there, time, end)
-        gain, left_over = retrodiction.bridge(Q_before, F, Q_after)
+        gain, left_over = retrodiction.bridge(Q_before, dense(F), Q_after)
         root = cholesky.factor(left_over).lower
         return there + matvec(gain, target - arrived) + matvec(root, normals)
 

@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import choose, copies
@@ -181,7 +182,7 @@ def _look_through(
         cov = gaussian.mask_cov(matmul(matmul(H, there.cov), H.T) + R, mask)
         good = are_finite(difference, cov, mask)
         difference, cov = jnp.where(good, difference, 0), jnp.where(good, cov, R)
-        innovation = gaussian.innovate(difference, H, cov, mask)
+        innovation = gaussian.innovate(difference, dense(H), cov, mask)
         return there.mean, predicted, innovation.cov, gaussian.log_density(innovation, mask), good
 
     there, predicted, cov, log_density, good = jax.vmap(seen_through, -1, -1)(state.particles)

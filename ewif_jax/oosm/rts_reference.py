@@ -8,7 +8,7 @@ from jax import Array, lax
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models import Model, patterns, predict_state
+from ewif_jax.models import Model, predict_state
 from ewif_jax.oosm.parts.history import HistoryState, one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
@@ -95,7 +95,7 @@ def _tied_state(
     now = Tie(state.time, state.mean, jnp.eye(n, dtype=state.mean.dtype), 0 * state.cov)
     nearest, _ = lax.scan(tied_back, now, state.past)
     mean, F, Q = predict_state(model, params, start.mean, start.time, time)
-    cov = symmetric.congruence(F, start.cov, patterns(model)[0]) + symmetric.pack(Q)
+    cov = symmetric.congruence(F, start.cov) + symmetric.pack(Q)
     tie = _one_step_behind(model, params, nearest, CovarianceState(time, mean, cov))
     return choose(time < nearest.time, tie, nearest)
 

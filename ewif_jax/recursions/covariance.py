@@ -8,8 +8,9 @@ import numpy as np
 from jax import Array
 
 from ewif_jax.fast.batched import largest
+from ewif_jax.fast.sparse import Matrix, apart, with_zeros
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, patterns, predict_state
+from ewif_jax.models import Model, predict_state
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.innovations import compared, updated
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Params, RandomKey
@@ -50,7 +51,7 @@ def covariance_recursion(
 
     def move(params: Params, state: CovarianceState, time: Array) -> CovarianceState:
         mean, F, Q = predict_state(model, params, state.mean, state.time, time)
-        cov = symmetric.congruence(F, state.cov, patterns(model)[0])
+        cov = symmetric.congruence(F, state.cov)
         if inflation is not None:
             cov = _inflated_cov(cov, inflation(params, state.time, time))
         return CovarianceState(time, mean, cov + symmetric.pack(Q))
@@ -77,15 +78,17 @@ def measure(
     moving = mean[: mean.shape[0] - still]
     seen = compared(model, params, moving, measurement)
     seen = seen._replace(H=unseen(seen.H, still))
-    where = patterns(model)[1]
+    return updated(model, mean, cov, seen)
+
+
+def unseen(H: Array | Matrix, still: int) -> Array | Matrix:
+    """H (m, n) of a state with as many more components."""
+    if not still:
+        return H
+    values, where = apart(H)
     if where is not None:
         where = tuple(row + (False,) * still for row in where)
-    return updated(model, mean, cov, seen, where)
-
-
-def unseen(H: Array, still: int) -> Array:
-    """H (m, n) of a state with as many more components."""
-    return jnp.pad(H, ((0, 0), (0, still))) if still else H
+    return with_zeros(jnp.pad(values, ((0, 0), (0, still))), where)
 
 
 def _inflated_cov(cov: Array, factor: Array) -> Array:

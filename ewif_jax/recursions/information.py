@@ -17,12 +17,13 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import absorbing, cholesky, equations, gaussian, remainders, symmetric
 from ewif_jax.kernels.growth import bounded_reciprocal, grown
 from ewif_jax.kernels.orthogonal import spread
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
-from ewif_jax.models.linearise import affine_flow, patterns, size
+from ewif_jax.models.linearise import affine_flow, size
 from ewif_jax.recursions.sighting import noise_of, sight, still_at_once, summed
 from ewif_jax.types import Gaussian, Info, Measurement, Numbers, Params, Status
 
@@ -73,22 +74,21 @@ def transport(
     dtype = state.mean.dtype
     F, c = affine_flow(model, params, state.time, time, dtype)
     checks.shape("F", F, (state.mean.shape[0],) * 2)
-    where = patterns(model)[0]
-    mean, rest = remainders.moved_with_rest(F, c, state.mean, where)
+    mean, rest = remainders.moved_with_rest(F, c, state.mean)
     variances = state.variances if fade is None else fade(state.variances)
     faded = state._replace(time=time, mean=mean, variances=variances)
     back, _ = affine_flow(model, params, time, state.time, dtype)
     # Chains of integrators have an upper triangular F: T F^-1 is then a unit upper triangular
     # matrix again but for a scaling of its rows, and nothing has to be made orthogonal.
-    if noise is None and where is not None and equations.is_upper(where):
-        rows, diagonal = equations.carried(faded.rows, back, where)
+    if noise is None and equations.is_upper(back):
+        rows, diagonal = equations.carried(faded.rows, back)
         there = faded._replace(
             variances=_over(faded.variances, diagonal),
             rows=rows,
             targets=faded.targets / diagonal,
         )
     else:
-        F, back = (still_at_once(model, x, time == state.time) for x in (F, back))
+        F, back = (dense(still_at_once(x, time == state.time)) for x in (F, back))
         there = moved(faded, F, back, noise)
         if model.steps is not None:
             # Of a part of the state, what is known cannot pass a singular F: no estimate after it

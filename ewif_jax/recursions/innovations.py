@@ -7,7 +7,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
-from ewif_jax.fast.sparse import Pattern
+from ewif_jax.fast.sparse import Matrix, dense
 from ewif_jax.kernels import gaussian, symmetric
 from ewif_jax.models import Model, predict_measurement
 from ewif_jax.types import Info, Measurement, Params, Status
@@ -18,7 +18,7 @@ class Compared(NamedTuple):
     H (m, n), noise covariance R (m, m), and mask (m,) of what is present."""
 
     difference: Array
-    H: Array
+    H: Array | Matrix
     R: Array
     mask: Array
 
@@ -60,17 +60,15 @@ def sound(model: Model, cov: Array, seen: Compared) -> tuple[Compared, Array]:
     difference, H, R, mask = seen
     if model.linear is not None:
         return seen, jnp.asarray(True)
-    H = jnp.where(mask[:, None], H, 0)
+    H = jnp.where(mask[:, None], dense(H), 0)
     good = are_finite(difference, matmul(symmetric.rows(H, cov), H.T) + R, mask)
     difference, H, R = (jnp.where(good, x, 0) for x in (difference, H, R))
     return Compared(difference, H, R, mask & good), good
 
 
-def updated(
-    model: Model, mean: Array, cov: Array, seen: Compared, H_where: Pattern | None = None
-) -> tuple[Array, Array, Info]:
-    """Mean and packed covariance after a measurement whose H may differ from zero `H_where`, with
-    its `Info` (delay 0, status USED or REJECTED)."""
+def updated(model: Model, mean: Array, cov: Array, seen: Compared) -> tuple[Array, Array, Info]:
+    """Mean and packed covariance after a measurement, with its `Info` (delay 0, status USED or
+    REJECTED)."""
     (difference, H, R, mask), good = sound(model, cov, seen)
-    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask, H_where)
+    mean, cov, innovation = gaussian.update(mean, cov, difference, H, R, mask)
     return mean, cov, info_of(innovation, mask, good)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels.growth import grown
 from ewif_jax.models.linearise import affine_flow
 from ewif_jax.models.model import Model
@@ -41,7 +42,7 @@ def passage(
     """The passage from t0 to t1; growing(params, t0, t1) is the factor on the variances."""
     F, c = affine_flow(model, params, t0, t1, dtype)
     back, _ = affine_flow(model, params, t1, t0, dtype)
-    F, back = (still_at_once(model, x, t0 == t1) for x in (F, back))
+    F, back = (dense(still_at_once(x, t0 == t1)) for x in (F, back))
     offset = jnp.zeros(F.shape[0], dtype) if c is None else c
     return Passage(F, offset, back, jnp.asarray(growing(params, t0, t1), dtype))
 

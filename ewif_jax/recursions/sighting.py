@@ -7,17 +7,18 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import Matrix, elementwise
 from ewif_jax.kernels import cholesky
 from ewif_jax.models import Model
-from ewif_jax.models.linearise import affine_flow, observation, patterns
+from ewif_jax.models.linearise import affine_flow, observation
 from ewif_jax.types import Measurement, Params
 
 
-def still_at_once(model: Model, F: Array, at_once: Array) -> Array:
+def still_at_once(F: Array | Matrix, at_once: Array) -> Array | Matrix:
     """F, the identity to the last bit over no time: where nothing is known of a direction yet, the
     rounding of a zero would be taken for what a measurement says of it. Where the zeros of F are
     known it is that already."""
-    if patterns(model)[0] is not None:
+    if isinstance(F, Matrix):
         return F
     return jnp.where(at_once, jnp.eye(F.shape[0], dtype=F.dtype), F)
 
@@ -35,15 +36,15 @@ def sight(
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
     checks.shape("H", H, ("m", mean.shape[0]))
     checks.shape("R", R, (H.shape[0],) * 2)
-    F_where, H_where = patterns(model)
-    A = still_at_once(model, A, measurement.time == now)
-    there = matvec(A, mean, F_where)
+    A = still_at_once(A, measurement.time == now)
+    there = matvec(A, mean)
     there = there if c is None else there + c
-    difference = model.residual(measurement.value, matvec(H, there, H_where), measurement.sensor)
-    seen = jnp.where(mask[:, None], matmul(H, A, H_where), 0)
+    difference = model.residual(measurement.value, matvec(H, there), measurement.sensor)
+    seen = jnp.where(mask[:, None], matmul(H, A), 0)
     size = None
-    if F_where is None:
-        size = jnp.where(mask[:, None], matmul(jnp.abs(H), jnp.abs(A), H_where), 0)
+    if not isinstance(A, Matrix):
+        sizes = matmul(elementwise(jnp.abs, H), jnp.abs(A))
+        size = jnp.where(mask[:, None], sizes, 0)
     return seen, jnp.where(mask, difference, 0), R, size
 
 

@@ -9,9 +9,10 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.linearise import patterns, predict_state
+from ewif_jax.models.linearise import predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
@@ -82,7 +83,8 @@ def flow_around(
     """Mean at t1 (n,), F (n, n), and Q (n, n) plus what F leaves over, of a packed `cov` at t0: of
     all but the last `still` components, which do not move."""
     if points is None or model.linear is not None:
-        return predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
+        moved, F, Q = predict_state(model, params, mean[: mean.shape[0] - still], t0, t1)
+        return moved, dense(F), Q
     root = _divisible_root(cov, mean.shape[0] - still)
     moved, line = _moved_line(model, points, params, mean, root.lower, t0, t1, still)
     Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)
@@ -95,7 +97,7 @@ def move_around(
     """Mean (n,) and packed covariance at t1 of a Gaussian at t0 with a packed `cov`."""
     if model.linear is not None:
         moved, F, Q = predict_state(model, params, mean, t0, t1)
-        return moved, symmetric.congruence(F, cov, patterns(model)[0]) + symmetric.pack(Q)
+        return moved, symmetric.congruence(F, cov) + symmetric.pack(Q)
     lower = _fine_root(cov, mean.shape[0])
     moved, line = _moved_line(model, points, params, mean, lower, t0, t1)
     Q = jnp.asarray(model.process_cov(params, t0, t1), mean.dtype)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ewif_jax import checks
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.entry import (
@@ -118,9 +119,9 @@ def _batch_wls(
         H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         A, c = affine_flow(model, params, time, measurement.time, dtype)
-        offset_seen = jnp.zeros(H.shape[0], dtype) if c is None else H @ c
+        offset_seen = jnp.zeros(H.shape[0], dtype) if c is None else dense(H) @ c
         target = model.residual(measurement.value, offset_seen, measurement.sensor)
-        rows = jnp.where(measurement.mask[:, None], jnp.c_[H @ A, target], 0)
+        rows = jnp.where(measurement.mask[:, None], jnp.c_[dense(H) @ dense(A), target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))
         white = jnp.where(noise.full_rank, cholesky.forward(noise, rows), jnp.nan)
         return _weighted_rows(weight(params, measurement.time, time), white)
@@ -129,7 +130,9 @@ def _batch_wls(
         A, c = affine_flow(model, params, time, t0, dtype)
         target = prior.mean if c is None else prior.mean - c
         spread = cholesky.factor(prior.cov)
-        return _weighted_rows(weight(params, t0, time), cholesky.forward(spread, jnp.c_[A, target]))
+        return _weighted_rows(
+            weight(params, t0, time), cholesky.forward(spread, jnp.c_[dense(A), target])
+        )
 
     def fitted_at(time: Array) -> Gaussian:
         rows = jax.vmap(partial(seen_from, time))(measurements)

@@ -8,8 +8,9 @@ from jax import Array, lax
 
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
+from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models import Model, patterns, predict_measurement, predict_state
+from ewif_jax.models import Model, predict_measurement, predict_state
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared
 from ewif_jax.types import Measurement, Params, State
@@ -53,24 +54,23 @@ def tied_to_start(
     """
     now = state.time
     time = jnp.clip(measurement.time, start.time, now)
-    F_where, H_where = patterns(model)
     there, F, Q = predict_state(model, params, start.mean, start.time, time)
-    cov = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q)
+    cov = symmetric.congruence(F, start.cov) + symmetric.pack(Q)
     predicted, F, Q = predict_state(model, params, there, time, now)
-    M = symmetric.congruence(F, cov, F_where) + symmetric.pack(Q)
+    M = symmetric.congruence(F, cov) + symmetric.pack(Q)
     value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    weights, _ = symmetric.regress(M, matmul(symmetric.rows(H, cov, H_where), F.T))
+    weights, _ = symmetric.regress(M, matmul(symmetric.rows(H, cov), F.T))
     value = value + matvec(weights, state.mean - predicted)
-    left = H - matmul(weights, F)
+    left = dense(H) - matmul(weights, F)
     # H cov(x_d | x_k) H' in Joseph's form, with G inside as H G: rounding of the weights enters
     # squared.
     spread = matmul(symmetric.rows(left, cov), left.T) + matmul(matmul(weights, Q), weights.T)
     # A plain update in sequence, to the last digit: there M adds nothing but its rounding.
     late = time < now
-    value = jnp.where(late, value, matvec(H, state.mean, H_where))
+    value = jnp.where(late, value, matvec(H, state.mean))
     difference = model.residual(measurement.value, value, measurement.sensor)
-    H, R = jnp.where(late, weights, H), jnp.where(late, R + spread, R)
+    H, R = jnp.where(late, weights, dense(H)), jnp.where(late, R + spread, R)
     return Compared(difference, H, R, measurement.mask), True
 
 
@@ -100,8 +100,7 @@ def moved_back(
     dtype, good = state.mean.dtype, jnp.asarray(True)
     at = jnp.clip(measurement.time, start.time, state.time)
     predicted, F, Q_all = predict_state(model, params, start.mean, start.time, state.time)
-    F_where, H_where = patterns(model)
-    M = symmetric.congruence(F, start.cov, F_where) + symmetric.pack(Q_all)
+    M = symmetric.congruence(F, start.cov) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
     moved, origin = state.mean - predicted, state.mean
     if noise_estimated and model.linear is None:
@@ -110,13 +109,13 @@ def moved_back(
         # The derivative of a motion that overflows is not a number even where it is not selected,
         # so the time is replaced, not the matrix.
         good = lax.stop_gradient(
-            _has_way_back(predict_state(model, params, origin, state.time, at)[1])
+            _has_way_back(dense(predict_state(model, params, origin, state.time, at)[1]))
         )
         at = jnp.where(good, at, state.time)
     there, back, _ = predict_state(model, params, origin, state.time, at)
     value, H, R = predict_measurement(model, params, there, measurement.sensor, measurement.time)
     checks.shape("measurement.value", measurement.value, (H.shape[0],))
-    seen = matmul(H, back, H_where)
+    seen = matmul(H, back)
     noisy = matmul(seen, Q)
     weights, explained = symmetric.regress(M, noisy)  # Q is part of M: what M has not, Q has not
     if noise_estimated and model.linear is not None:
