@@ -62,6 +62,8 @@ def _one_absorbed(
     # What is left of the equation for each row has to be found one row after the other, and is all
     # that is: variances are computed for all rows at once, which compiles in half the time.
     n = equation.shape[0]
+    # Scales are compared with, and nothing else: they need no derivatives.
+    scale = lax.stop_gradient(scale)
     unknown = jnp.isinf(variances)
     finite = jnp.where(unknown, 0, variances)
     before = by_equation(rows, n)
@@ -73,7 +75,8 @@ def _one_absorbed(
         )
         leads.append(lead)
         if k < n - 1:
-            equation, scale = stage(_left_of, row, equation[1:], scale, lead, batch=batch)
+            equation = stage(_left_of, row, equation[1:], lead, batch=batch)
+            scale = stage(_scale_after, lax.stop_gradient(row), scale, batch=batch)
             rests.append(equation)
     lead, noise = stacked(leads), stacked(noises)
     kept, steps = stage(_learnt_variances, variances, finite, noise, lead, batch=batch)
@@ -106,9 +109,14 @@ def _lead_at(n: int) -> Callable[..., tuple[Array, Array]]:
 
 
 @kept_apart
-def _left_of(row: Array, rest: Array, scale: Array, lead: Array) -> tuple[Array, Array]:
+def _left_of(row: Array, rest: Array, lead: Array) -> Array:
+    return rest - lead[None] * row
+
+
+@kept_apart
+def _scale_after(row: Array, scale: Array) -> Array:
     # The rounding of the lead, however little of it is left, is in all that it takes out.
-    return rest - lead[None] * row, jnp.maximum(scale[1:], scale[0][None] * jnp.abs(row))
+    return jnp.maximum(scale[1:], scale[0][None] * jnp.abs(row))
 
 
 @kept_apart
@@ -145,9 +153,9 @@ def _corrected_row(row: Array, rest: Array, step: Array) -> Array:
 
 @kernel
 def _answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
-    for residual, lead, step in zip(residuals, leads, steps, strict=True):
-        said, left = lead * targets, [residual]
-        for part in said:
-            left.append(left[-1] - part)
-        targets = targets + step * stacked(left[1:])
-    return targets
+    found = list(targets)
+    for left, lead, step in zip(residuals, leads, steps, strict=True):
+        for k, target in enumerate(found):
+            left = left - lead[k] * target
+            found[k] = target + step[k] * left
+    return stacked(found)
