@@ -13,7 +13,7 @@ from jax import Array
 from ewif_jax import checks, shown
 from ewif_jax.estimator import Clock
 from ewif_jax.fast.dependence import dependence, traced
-from ewif_jax.fast.layout import Frozen, broadcast_prefix
+from ewif_jax.fast.layout import Frozen, broadcast_prefix, equal_parts
 from ewif_jax.moments import Moments, combined, shifted, standard_error
 from ewif_jax.recipe import FromRecipe
 from ewif_jax.scores import Score, average, scored, squared_error
@@ -149,10 +149,8 @@ def monte_carlo(
     per_run: list[dict[str, np.ndarray]] = []
     missing: list[dict[str, np.ndarray]] = []
     moments: dict[str, Moments] = {}
-    for begin in range(0, runs, chunk):
-        count = min(chunk, runs - begin)
-        # Filled up with repetitions, so that the last chunk is not compiled again.
-        index = np.minimum(np.arange(begin, begin + chunk), runs - 1)
+    for index in equal_parts(runs, chunk):
+        count = np.unique(index).size
         some = jax.tree.map(lambda x, f, i=index: x[i] if f else x, params, marked)
         # A run's keys come from its number, not from its place in a chunk: chunk and device count
         # change no number.
@@ -180,7 +178,7 @@ def monte_carlo(
             added = shifted(*(np.asarray(x, float) for x in parts))
             moments[name] = combined(moments[name], added) if name in moments else added
         if progress is not None:
-            progress(begin + count, runs)
+            progress(int(index[-1]) + 1, runs)
     per_step = {name: found.mean for name, found in moments.items()}
     errors = {name: standard_error(found) for name, found in moments.items()}
     return Statistics(_join_parts(per_run), per_step, errors, _join_parts(missing))

@@ -1,6 +1,6 @@
 """Runs as the last axis: mapping over it, splitting it up."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -94,6 +94,17 @@ def over_devices(fn: Callable[..., Any], flags: tuple, devices: int) -> Callable
     specs = jax.tree.map(lambda f: split if f else shared, flags)
     mesh = _device_mesh(devices)
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
+
+
+def equal_part(count: int, size: int, k: int) -> np.ndarray:
+    """Indices of part number k of 0 .. count - 1 in parts of one size, the last filled up with its
+    last: one program does for all of them."""
+    return np.minimum(np.arange(k * size, (k + 1) * size), count - 1)
+
+
+def equal_parts(count: int, size: int) -> Iterator[np.ndarray]:
+    """All of them, one after the other."""
+    return (equal_part(count, size, k) for k in range(-(-count // size)))
 
 
 def on_devices(tree: PyTree, flags: PyTree, devices: int) -> Any:

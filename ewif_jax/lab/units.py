@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ewif_jax.batch import Observer, Step, run_batch
+from ewif_jax.fast.layout import equal_part
 from ewif_jax.lab import methods as lines
 from ewif_jax.lab.design import Design
 from ewif_jax.lab.timing import timed
@@ -44,8 +45,7 @@ def computed(
     compiling.
     """
     real = design.runs_of(chunk)
-    # Filled up with repetitions, so that the last chunk is not compiled again.
-    index = np.minimum(np.arange(design.chunk) + chunk * design.chunk, design.runs - 1)
+    index = equal_part(design.runs, design.chunk, chunk)
     keys, own_keys = run_keys(design.key, index)
     with timed() as simulating:
         simulation = simulate_batch(design.scenario, keys, design.world_at(point))

@@ -12,6 +12,7 @@ from jax import Array
 from ewif_jax.batch import Step
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.fast.compiling import array
+from ewif_jax.fast.layout import equal_parts
 from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.scores import Score, average, scored, squared_error
@@ -64,13 +65,11 @@ def sweep(
     parts = -(-count // max((chunk or 1024) // runs, 1))
     size = -(-count // parts)
     found = []
-    for begin in range(0, count, size):
-        # equal parts (the last padded) are compiled once
-        index = np.minimum(np.arange(begin, begin + size), count - 1)
+    for index in equal_parts(count, size):
         some = {name: v[index].reshape(-1) for name, v in full.items()}
         found.append(_average_errors(estimator, some, batch, setting))
         if progress is not None:
-            progress(min(begin + size, count), count)
+            progress(int(index[-1]) + 1, count)
     return {name: np.concatenate([f[name] for f in found])[:count] for name in METRICS}
 
 

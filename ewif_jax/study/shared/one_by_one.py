@@ -6,9 +6,9 @@ from typing import Any
 import jax
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
 
 from ewif_jax.estimator import Clock, run
+from ewif_jax.fast.layout import equal_part, equal_parts, over_devices
 from ewif_jax.lab.timing import timed
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.study.shared.experiment import Measured
@@ -23,19 +23,16 @@ PARTS = 5
 def over_cores(compute: Callable[..., Any]) -> Callable[..., Any]:
     """`compute` for each entry of the leading axis of its arguments, one after the other on each
     local device; arrays of the host come back. It is compiled once for each length."""
-    devices = jax.local_devices()
-    mesh, split = Mesh(np.asarray(devices), ("runs",)), PartitionSpec("runs")
+    devices = len(jax.local_devices())
 
     def on_one(inputs: tuple) -> Any:
         return lax.map(lambda one: compute(*one), inputs)
 
-    program = jax.jit(
-        jax.shard_map(on_one, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
-    )
+    program = jax.jit(over_devices(on_one, (True,), devices))
 
     def call(*inputs: Any) -> Any:
         count = jax.tree.leaves(inputs)[0].shape[0]
-        index = np.minimum(np.arange(-(-count // len(devices)) * len(devices)), count - 1)
+        index = equal_part(count, -(-count // devices) * devices, 0)
         found = program(jax.tree.map(lambda x: x[index], inputs))
         return jax.tree.map(lambda x: x[:count], jax.device_get(found))
 
@@ -68,9 +65,7 @@ def tracker(
         runs, cores = keys.shape[0], len(jax.local_devices())
         size = -(-runs // (min(PARTS, runs) * cores)) * cores
         found = []
-        for begin in range(0, runs, size):
-            # equal parts (the last padded) are compiled once
-            index = np.minimum(np.arange(begin, begin + size), runs - 1)
+        for index in equal_parts(runs, size):
             some = jax.tree.map(lambda x, i=index: x[i], (simulations, keys))
             with timed() as timing:
                 part = program(*some)
