@@ -142,7 +142,7 @@ def test_what_is_learned_through_late_measurements_is_better_on_other_runs(numbe
     lag = max(history_needed(x.measurements) for x in (seen, batch))
     experiment = Experiment("tuning", Options(out=tmp_path, quick=True))
     prior = scenario.prior if one.prior else None
-    found = tuning._found(experiment, one, lag, seen, batch, prior)
+    found = tuning._found_optimum(experiment, one, lag, seen, batch, prior)
     published, learned = found["squared"]
     difference = paired(learned, published)
     assert difference.value < -4 * difference.error

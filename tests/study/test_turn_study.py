@@ -35,7 +35,7 @@ def light(particles=10):
 
 
 def test_study_runs_end_to_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs_of, "methods", light)
+    monkeypatch.setattr(runs_of, "turn_methods", light)
     monkeypatch.setattr(turn, "BLOCK", 8)
     assert run(["study", "turn", "--quick", "--runs", "16", "--out", str(tmp_path)]) == 0
     folder = tmp_path / "turn"

@@ -35,7 +35,7 @@ METHODS = tuple(runs_of.bearings_methods(10))
 
 
 def test_study_runs_end_to_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs_of, "methods", light)
+    monkeypatch.setattr(runs_of, "bearings_methods", light)
     assert run(["study", "two-bearings", "--quick", "--runs", "2", "--out", str(tmp_path)]) == 0
     folder = tmp_path / "two-bearings"
     found = {path.name for path in folder.iterdir()}
