@@ -240,8 +240,8 @@ def test_tracks_of_like_length_go_together(tmp_path):
 
 def test_a_short_track_is_filtered_beside_a_long_one(tmp_path, capsys, monkeypatch):
     """The long track alone, the short ones alone, and all together: the same estimates."""
-    monkeypatch.setattr("ewif_jax.study.track.figures.innovations", lambda *_: None)
-    monkeypatch.setattr("ewif_jax.study.track.figures.tracks", lambda *_: None)
+    monkeypatch.setattr("ewif_jax.study.track.figures.innovation_panels", lambda *_: None)
+    monkeypatch.setattr("ewif_jax.study.track.figures.track_maps", lambda *_: None)
     monkeypatch.setattr("ewif_jax.study.shared.experiment.Experiment.figure", lambda *_: None)
     frame, found = long_and_short(tmp_path / "all.csv"), {}
     for name, some in (("long", frame["track"] == "t15"), ("short", frame["track"] == "t03")):
