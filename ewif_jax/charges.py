@@ -102,7 +102,8 @@ def truth_charges(
     if components is not None:
         shape = np.broadcast_shapes(apart.shape, np.shape(components))
         apart = xp.broadcast_to(apart, shape) * xp.asarray(components)
-    charge = xp.einsum("...i,...i->...", apart, apart)
+    nothing = xp.zeros(apart.shape[:-1], apart.dtype)
+    charge = sum((xp.square(apart[..., i]) for i in range(apart.shape[-1])), nothing)
     measured = xp.broadcast_to(unknowns, np.shape(mask)[:-1])
     if unknowns > 0:
         measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)

@@ -9,6 +9,9 @@ from jax import Array, lax
 from ewif_jax.fast.batched import kept_apart, kernel, stacked, stage
 from ewif_jax.kernels.equations import by_equation
 
+FEW = 4
+"""Components of a measurement, which are written out; a window or a whole state is a loop."""
+
 
 def absorbed(
     variances: Array, rows: Array, equations: Array, noises: Array, sizes: Array | None = None
@@ -39,11 +42,7 @@ def _absorbed(
         one = _one_absorbed(variances, rows, equations[0], noises[0], sizes[0], batch)
         return one[0], one[1], one[2][None], one[3][None]
     # A loop, although it has a few rounds only: written out, each would be compiled by itself.
-    given = variances, rows, equations, noises, sizes
-    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in given))
-
-    def widened(x: Array) -> Array:
-        return jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs)
+    variances, rows, *new = _alike(batch, variances, rows, equations, noises, sizes)
 
     def add(
         before: tuple[Array, Array], new: tuple[Array, Array, Array]
@@ -51,9 +50,14 @@ def _absorbed(
         kept, changed, leads, steps = _one_absorbed(*before, *new, batch)
         return (kept, changed), (leads, steps)
 
-    new = widened(equations), widened(noises), widened(sizes)
-    kept, told = lax.scan(add, (widened(variances), widened(rows)), new)
+    kept, told = lax.scan(add, (variances, rows), (new[0], new[1], new[2]))
     return *kept, *told
+
+
+def _alike(batch: int, *arrays: Array) -> list[Array]:
+    """The arrays with equal trailing axes, which a loop's states must keep."""
+    runs = jnp.broadcast_shapes(*(x.shape[x.ndim - batch :] for x in arrays))
+    return [jnp.broadcast_to(x, x.shape[: x.ndim - batch] + runs) for x in arrays]
 
 
 def _one_absorbed(
@@ -153,9 +157,23 @@ def _corrected_row(row: Array, rest: Array, step: Array) -> Array:
 
 @kernel
 def _answered(targets: Array, residuals: Array, leads: Array, steps: Array) -> Array:
-    found = list(targets)
-    for left, lead, step in zip(residuals, leads, steps, strict=True):
-        for k, target in enumerate(found):
-            left = left - lead[k] * target
-            found[k] = target + step[k] * left
+    batch = residuals.ndim - 1
+    if len(residuals) <= FEW:
+        for residual, lead, step in zip(residuals, leads, steps, strict=True):
+            targets = _one_answered(targets, residual, lead, step)
+        return targets
+    targets, *new = _alike(batch, targets, residuals, leads, steps)
+
+    def answer(before: Array, new: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        return _one_answered(before, *new), None
+
+    return lax.scan(answer, targets, (new[0], new[1], new[2]))[0]
+
+
+def _one_answered(targets: Array, residual: Array, leads: Array, steps: Array) -> Array:
+    # Number by number: as vectors the slopes take four times as long (docs/decisions/fast.md).
+    left, found = residual, []
+    for target, lead, step in zip(targets, leads, steps, strict=True):
+        left = left - lead * target
+        found.append(target + step * left)
     return stacked(found)
