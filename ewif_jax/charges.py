@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from ewif_jax.fast.batched import total
 from ewif_jax.kernels.forecasts import gaussian_crps, gaussian_energy
 from ewif_jax.streams import float_dtype
 from ewif_jax.types import Measurement, Numbers
@@ -102,8 +103,7 @@ def truth_charges(
     if components is not None:
         shape = np.broadcast_shapes(apart.shape, np.shape(components))
         apart = xp.broadcast_to(apart, shape) * xp.asarray(components)
-    nothing = xp.zeros(apart.shape[:-1], apart.dtype)
-    charge = sum((xp.square(apart[..., i]) for i in range(apart.shape[-1])), nothing)
+    charge = total(xp.square(apart[..., i]) for i in range(apart.shape[-1]))
     measured = xp.broadcast_to(unknowns, np.shape(mask)[:-1])
     if unknowns > 0:
         measured = xp.cumsum(xp.asarray(mask, bool).sum(-1), -1)
