@@ -8,6 +8,7 @@ from jax import Array
 
 from ewif_jax.clocks import slack
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models.components import existing
 from ewif_jax.models.steps import whole_steps
 from ewif_jax.streams import cast, in_dtype
 from ewif_jax.types import (
@@ -80,7 +81,7 @@ def arrive(
     `REJECTED`, and moves nothing; so is a stamp ahead of the clock by more than rounding. A time
     that is not a number counts as the state's, or the clock's.
     """
-    measurement = cast(measurement, state.time.dtype)
+    measurement = cast(existing(estimator.model, measurement), state.time.dtype)
     now = state.time if clock_time is None else jnp.maximum(state.time, clock_time)
     stamp = jnp.where(jnp.isfinite(measurement.time), measurement.time, now)
     now, refused = _clock_place(estimator, state.time, now, stamp, clock_time is not None)

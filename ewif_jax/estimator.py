@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit, transformed
 from ewif_jax.fast.slopes import with_few_slopes
+from ewif_jax.models.components import check_components
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
 from ewif_jax.types import (
@@ -62,6 +63,7 @@ def run(
     """
     checks.estimator(estimator)
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    check_components(estimator.model, measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = prior_in(prior, float_dtype(measurements.value))
     filtered = _compiled_run(measurements.time.shape[0], state, key)

@@ -14,6 +14,7 @@ from ewif_jax.arrival import Screened, screen
 from ewif_jax.checks import require
 from ewif_jax.fast.layout import broadcast_prefix, one_run
 from ewif_jax.fast.memo import once
+from ewif_jax.models.components import check_components
 from ewif_jax.models.entry import check_times
 from ewif_jax.streams import float_dtype
 from ewif_jax.trial import validated
@@ -138,6 +139,7 @@ def check_runs(
     params, params_f = inputs[0], flags[0]
     dtype = float_dtype(inputs[1].value)
     check_times(estimator.model, inputs[1], t0, dtype, inputs[3])
+    check_components(estimator.model, inputs[1])
     _, measurements, prior, times = one_run(inputs, flags)
     sensors = checks.concrete_value(inputs[1].sensor)
     if sensors is not None and sensors.ndim == 2:

@@ -17,6 +17,7 @@ from ewif_jax.fast.layout import Frozen, one_run
 from ewif_jax.fast.loops import Loop, over_runs
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.fast.slopes import with_few_slopes
+from ewif_jax.models.components import check_components
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.models.steps import check_steps
@@ -54,9 +55,10 @@ def step(
 
     Raises:
         ValueError: a known time between two steps of a discrete model; a known sensor that the
-            model has not; known parameters that make no covariances.
+            model has not, or components that it has not; known parameters that make no covariances.
     """
     checks.estimator(estimator)
+    check_components(estimator.model, measurement, "measurement")
     _check_arrival(estimator, params, state, measurement)
     return _step(estimator, params, state, measurement)
 
@@ -103,6 +105,7 @@ def step_batch(
     marks = ranked(measurement, (0, 1, 0, 1))
     same_runs("measurement", measurement, marks, runs)
     _check_steps_of_tracks(estimator, state, measurement)
+    check_components(estimator.model, measurement, "measurement")
     # Tracks with the lowest parameters are where a variance would be negative first; to check all R
     # one by one would take longer than the step.
     for k in {0, *lowest(params, flags)}:

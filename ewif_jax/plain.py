@@ -50,6 +50,33 @@ def numbers(argument: str, x: Numbers, missing: bool = False) -> Any:
     return value.astype(float) if longer else native(value)
 
 
+def equal_rows(argument: str, x: Numbers, filler: Numbers) -> Any:
+    """Of a list of arrays (lists, numbers) of different lengths an array (T, longest), filled up;
+    anything else as it is."""
+    if not isinstance(x, list | tuple) or not all(map(_is_flat, x)):
+        return x
+    longest = max(map(np.size, x), default=0)
+    if all(np.size(row) == longest for row in x):
+        return x
+    rows = []
+    for row in x:
+        if isinstance(row, np.ma.MaskedArray):
+            row = np.ma.filled(row.astype(float), np.nan)
+        xp = jnp if isinstance(row, Array) else np
+        row = xp.atleast_1d(row if isinstance(row, Array) else checks.from_rows(argument, row))
+        dtype = xp.result_type(row.dtype, filler)
+        fill = xp.full(longest - row.size, filler, dtype)
+        rows.append(xp.concatenate([row.astype(dtype), fill]))
+    return (jnp if any(isinstance(row, Array) for row in rows) else np).stack(rows)
+
+
+def _is_flat(row: Numbers) -> bool:
+    """Whether it is a number, or one axis of numbers."""
+    if isinstance(row, list | tuple):
+        return not any(isinstance(one, list | tuple) or np.ndim(one) for one in row)
+    return np.ndim(row) < 2
+
+
 def indices(argument: str, x: Numbers) -> Any:
     """`x` as int32 indices, NumPy's unless it is an array of JAX.
 

@@ -29,11 +29,12 @@ def stream(
         time: (T,) validity times in seconds, in order of arrival. Date-times (datetime64,
             `datetime`, pandas with or without a time zone) become seconds since the first row
             given, in float64 until the filter's dtype is known; durations become seconds.
-        value: (T,) or (T, m) numbers; NaN, None and masked elements mean missing (with a `mask`
-            given, masked elements do, and the rest is as `mask` says). float16 and narrower values
-            become float32: no filter runs in them.
+        value: (T,) or (T, m) numbers, or a list of T arrays, as long as the sensors have
+            components, that is filled up to the longest; NaN, None and masked elements mean missing
+            (with a `mask` given, masked elements do, and the rest is as `mask` says). float16 and
+            narrower values become float32: no filter runs in them.
         sensor: index or (T,) indices, whole numbers >= 0; default sensor 0.
-        mask: (T,) or (T, m) booleans; default: where `value` is finite.
+        mask: (T,) or (T, m) booleans, or a list of T arrays; default: where `value` is finite.
         arrival: (T,) when each arrives, in any order: the stream is sorted by it, what arrives
             together in the order given. `arrival_order` gives the same order for what goes along
             (report times, truth).
@@ -44,6 +45,8 @@ def stream(
             among the sensors; a mask of anything else than booleans.
     """
     time, _, _ = clocks.in_seconds(time, name="time")
+    value = plain.equal_rows("value", value, np.nan)
+    mask = plain.equal_rows("mask", mask, False)
     hidden = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else None
     value = plain.numbers("value", value.filled(0) if hidden is not None else value, missing=True)
     sensor = plain.indices("sensor", sensor)

@@ -346,12 +346,12 @@ REFUSED = {
         "noise: expected 'white' or 'discrete', got 'pink'",
     ),
     "no sensor": (lambda: random_walk(sensors=()), "sensors: expected at least one sensor"),
-    "sensors of other sizes": (
-        lambda: constant_velocity(sensors=[position_sensor(1.0), position_sensor(1.0, 2)], dims=2),
-        "sensors: expected equal numbers of components, got [1, 2]",
+    "something else among the sensors": (
+        lambda: constant_velocity(sensors=[position_sensor(1.0), 2.0], dims=2),
+        "sensors[1]: expected a Sensor, got a float",
     ),
     "r < 0": (lambda: position_sensor(-1.0), "r: expected a number >= 0.0, got -1.0"),
-    "r a vector": (lambda: position_sensor(np.ones(2)), "r: expected shape (), got shape (2,)"),
+    "r a vector": (lambda: position_sensor(np.ones(2)), "r: expected shape (1,), got shape (2,)"),
     "a bearing sensor in space": (
         lambda: bearing_sensor(1.0, (0.0, 0.0, 0.0)),
         "position: expected shape (2,), got shape (3,)",

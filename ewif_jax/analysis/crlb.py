@@ -11,6 +11,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.models import Model
+from ewif_jax.models.components import check_components, existing
 from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement, Numbers, Params, State
 
@@ -57,10 +58,11 @@ def crlb(
             measurement has no finite information: give it a small variance).
     """
     checked_stream(measurements)
+    check_components(model, measurements)
     checks.finite("time", time)
     dtype = float_dtype(state)
     check_finite_information(model, params, measurements)
-    stream, time = cast(measurements, dtype), jnp.asarray(time, dtype)
+    stream, time = cast(existing(model, measurements), dtype), jnp.asarray(time, dtype)
     state = jnp.asarray(state, dtype)
     checks.shape("state", state, ("n",))
     n = state.shape[0]

@@ -14,6 +14,7 @@ from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, predict_measurement, predict_state
+from ewif_jax.models.components import check_components, existing
 from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement, Numbers, Parameter, Params
 
@@ -304,6 +305,7 @@ def _checked_inputs(
     truth, after what can be known is checked."""
     checked_stream(measurements)
     checks.sensors(measurements, model.sensors)
+    check_components(model, measurements)
     check_finite_information(model, params, measurements)
     steps = jnp.shape(measurements.time)[0]
     checks.shape("truth", truth, ("R", steps, "n"))
@@ -319,4 +321,4 @@ def _checked_inputs(
     checks.require(after, "measurements.time", f"times from t0 = {begin} on", time)
     dtype = float_dtype(truth)
     truth, start, cov, t0 = (jnp.asarray(x, dtype) for x in (truth, start, prior_cov, t0))
-    return cast(measurements, dtype), truth, (cov, start, t0)
+    return cast(existing(model, measurements), dtype), truth, (cov, start, t0)

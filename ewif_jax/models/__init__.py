@@ -16,13 +16,22 @@ from ewif_jax.models.linearise import (
 )
 from ewif_jax.models.model import Linear, Model, linear_model
 from ewif_jax.models.parameters import resolve
-from ewif_jax.models.sensors import Sensor, bearing_sensor, position_sensor, wrap_angle
+from ewif_jax.models.ranging import (
+    azimuth_elevation_range_sensor,
+    bearing_sensor,
+    range_bearing_rate_sensor,
+    range_bearing_sensor,
+    range_rate_sensor,
+    range_sensor,
+)
+from ewif_jax.models.sensors import Sensor, position_sensor, sensor, velocity_sensor, wrap_angle
 
 __all__ = [
     "Linear",
     "Model",
     "Sensor",
     "affine_flow",
+    "azimuth_elevation_range_sensor",
     "bearing_sensor",
     "constant_acceleration",
     "constant_velocity",
@@ -34,7 +43,13 @@ __all__ = [
     "predict_measurement",
     "predict_state",
     "random_walk",
+    "range_bearing_rate_sensor",
+    "range_bearing_sensor",
+    "range_rate_sensor",
+    "range_sensor",
     "resolve",
+    "sensor",
     "size",
+    "velocity_sensor",
     "wrap_angle",
 ]

@@ -12,11 +12,12 @@ from jax.core import Tracer
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.models import domain
+from ewif_jax.models.bank import Bank, bank
 from ewif_jax.models.discrete import pattern_of_powers
 from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
 from ewif_jax.models.parameters import named
 from ewif_jax.models.powers import Stride, both_strides
-from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.models.sensors import Seen, Sensor
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import DTypeLike, Numbers, Parameter, Params
 
@@ -122,28 +123,17 @@ def from_continuous(
     if sensors is None:
         seen = linear_model(F, H, R, b=offset)
     else:
-        observe, cov, residual, matrix, count = bank(sensors)
-        linear = None
-        if matrix is not None:
-            if callable(A):  # its size is known when it is asked
-
-                def H_of(params: Params, sensor: Array, t: Array) -> Array:
-                    size = jax.eval_shape(lambda: _matrix_value(A, params)).shape[0]
-                    return matrix(size)[0](params, sensor, t)
-
-                linear = Linear(F, offset, H_of)
-            else:
-                H_all, H_where = matrix(len(A))
-                linear = Linear(F, offset, H_all, F_where, H_where)
+        group = bank(sensors)
         seen = Model(
             affine_motion(F, offset),
             process_cov,
-            observe,
-            cov,
-            residual,
-            linear,
-            count,
-            check=domain.check_covariances(None, cov),
+            group.observe,
+            group.cov,
+            group.residual,
+            _seen_linearly(A, group, F, offset),
+            group.count,
+            check=domain.check_covariances(None, group.cov),
+            sizes=group.sizes,
         )
     check_seen = seen.check
 
@@ -156,6 +146,22 @@ def from_continuous(
     if seen.linear is not None:
         seen = seen._replace(linear=seen.linear._replace(F_where=F_where))
     return seen._replace(process_cov=process_cov, check=check)
+
+
+def _seen_linearly(A: Parameter, group: Bank, F: Seen, b: Seen | None) -> Linear | None:
+    """The matrices of the model, if all sensors are linear."""
+    matrix = group.matrix
+    if matrix is None:
+        return None
+    if not callable(A):
+        H, H_where = matrix(len(A))
+        return Linear(F, b, H, None, H_where, offset=group.offset)
+
+    def H_of(params: Params, sensor: Array, t: Array) -> Array:
+        size = jax.eval_shape(lambda: _matrix_value(A, params)).shape[0]  # known when it is asked
+        return matrix(size)[0](params, sensor, t)
+
+    return Linear(F, b, H_of, offset=group.offset)
 
 
 def integrated(

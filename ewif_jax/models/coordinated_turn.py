@@ -8,9 +8,10 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models import domain
+from ewif_jax.models.bank import bank
 from ewif_jax.models.model import Model
 from ewif_jax.models.parameters import resolve
-from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.models.sensors import Sensor
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Numbers, Parameter, Params
 
@@ -63,8 +64,8 @@ def coordinated_turn(
     for argument, density in (("q", q), ("q_turn", q_turn)):
         if not callable(density):
             domain.check_variance(argument, density)
-    observe, cov, residual, _, count = bank(sensors)
-    check_seen = domain.check_covariances(None, cov)
+    group = bank(sensors)
+    check_seen = domain.check_covariances(None, group.cov)
 
     def transition(params: Params, x: Array, t0: Array, t1: Array) -> Array:
         del params
@@ -98,7 +99,16 @@ def coordinated_turn(
                 domain.check_variance(argument, resolve(density, params))
         check_seen(params, t0, t1, sensors)
 
-    return Model(transition, process_cov, observe, cov, residual, sensors=count, check=check)
+    return Model(
+        transition,
+        process_cov,
+        group.observe,
+        group.cov,
+        group.residual,
+        sensors=group.count,
+        check=check,
+        sizes=group.sizes,
+    )
 
 
 def _sine_ratio(a: Array) -> Array:

@@ -32,19 +32,19 @@ def scaled(factor: Numbers, matrix: Array) -> Array:
     return factor.astype(dtype) * matrix.astype(dtype)
 
 
-def variance(argument: str, value: Numbers, params: Params) -> Any:
-    """A variance or density () read from `params`; NaN if it turns out to be none."""
+def variance(argument: str, value: Numbers, params: Params, expected: tuple[int, ...] = ()) -> Any:
+    """A variance or density (), or several, read from `params`; NaN if it turns out to be none."""
     found = resolve(value, params)
-    check_variance(argument, found)
+    check_variance(argument, found, expected)
     if checks.concrete_value(found) is not None:
         return found if np.ndim(found) == 0 and not hasattr(found, "dtype") else floating(found)
     found = floating(found)
     return jnp.where((found >= 0) & (found < jnp.inf), found, jnp.nan)
 
 
-def check_variance(argument: str, value: Numbers) -> None:
-    """Refuses a known number that is no variance."""
-    checks.shape(argument, value, ())
+def check_variance(argument: str, value: Numbers, expected: tuple[int, ...] = ()) -> None:
+    """Refuses a known number (or numbers of the shape `expected`) that is no variance."""
+    checks.shape(argument, value, expected)
     checks.at_least(argument, value, 0.0)
     checks.finite(argument, value)
 

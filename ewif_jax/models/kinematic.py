@@ -16,9 +16,10 @@ from ewif_jax import checks
 from ewif_jax.fast.batched import kernel
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models import domain
+from ewif_jax.models.bank import bank
 from ewif_jax.models.model import Linear, Model, affine_motion
 from ewif_jax.models.parameters import resolve
-from ewif_jax.models.sensors import Sensor, bank
+from ewif_jax.models.sensors import Sensor
 from ewif_jax.recipe import from_recipe
 from ewif_jax.types import Numbers, Parameter, Params
 
@@ -85,8 +86,8 @@ def _kinematic_model(
     if not callable(q):
         domain.check_variance("q", q)
     n = (order + 1) * dims
-    observe, cov, residual, matrix, count = bank(sensors)
-    check_seen = domain.check_covariances(None, cov)
+    group = bank(sensors)
+    check_seen = domain.check_covariances(None, group.cov)
     motion, spread, F_where = _motion_matrices(order, dims, noise)
 
     def F(params: Params, t0: Array, t1: Array) -> Array:
@@ -102,20 +103,21 @@ def _kinematic_model(
         check_seen(params, t0, t1, sensors)
 
     linear = None
-    if matrix is not None:
-        H, H_where = matrix(n)
-        linear = Linear(F, b, H, F_where, H_where)
+    if group.matrix is not None:
+        H, H_where = group.matrix(n)
+        linear = Linear(F, b, H, F_where, H_where, offset=group.offset)
     transition = affine_motion(F, b)
     return Model(
         transition,
         process_cov,
-        observe,
-        cov,
-        residual,
+        group.observe,
+        group.cov,
+        group.residual,
         linear,
-        count,
+        group.count,
         check=check,
         returns_well=True,
+        sizes=group.sizes,
     )
 
 

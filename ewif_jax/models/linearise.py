@@ -44,7 +44,7 @@ def predict_measurement(
         )
         checks.shape("H", H, ("m", x.shape[0]))
         checks.shape("R", R, (H.shape[0],) * 2)
-        return matvec(H, x), H, R
+        return predicted_value(model, params, H, x, sensor, t), H, R
 
     def see(x: Array) -> Array:
         return jnp.asarray(model.observe(params, x, sensor, t), x.dtype)
@@ -64,6 +64,16 @@ def affine_flow(
     linear = need_linear(model, "this operation")
     F, c = affine(linear.F, linear.b, params, t0, t1, dtype)
     return with_zeros(F, linear.F_where), c
+
+
+def predicted_value(
+    model: Model, params: Params, H: Array | Matrix, x: Array, sensor: Array, t: Array
+) -> Array:
+    """What a linear sensor of matrix H says of x (n,): H x, and its offset if there is one."""
+    seen, linear = matvec(H, x), need_linear(model, "this operation")
+    if linear.offset is None:
+        return seen
+    return seen + jnp.asarray(linear.offset(params, sensor, t), seen.dtype)
 
 
 def observation(

@@ -15,7 +15,15 @@ from ewif_jax.fast.sparse import Pattern
 from ewif_jax.models import domain
 from ewif_jax.models.discrete import constant, is_discrete, motion, pattern_of_powers
 from ewif_jax.models.parameters import named, resolve
-from ewif_jax.models.tables import by_sensor, count_sensors, pattern_of_table
+from ewif_jax.models.tables import (
+    by_sensor,
+    count_sensors,
+    of_sizes,
+    pattern_of_table,
+    same_sizes,
+    wider,
+    wider_cov,
+)
 from ewif_jax.recipe import FromRecipe, from_recipe
 from ewif_jax.types import DTypeLike, Parameter, Params, Steps
 
@@ -34,6 +42,7 @@ class Linear(NamedTuple):
     F(params, t0, t1) -> (n, n); b(params, t0, t1) -> (n,) or None; H(params, sensor, t) -> (m, n).
     F_where and H_where: where F (in either direction) and H may differ from zero, if that is known;
     what is zero is not computed. reversible: False where F is known to have no inverse.
+    offset: offset(params, sensor, t) -> (m,) where z = H x + offset, or None.
     """
 
     F: Callable[..., Array]
@@ -42,6 +51,7 @@ class Linear(NamedTuple):
     F_where: Pattern | None = None
     H_where: Pattern | None = None
     reversible: bool = True
+    offset: Callable[..., Array] | None = None
 
 
 class _ModelFields(NamedTuple):
@@ -55,6 +65,7 @@ class _ModelFields(NamedTuple):
     steps: Steps | None = None
     check: Callable[..., None] | None = None
     returns_well: bool = False
+    sizes: tuple[int, ...] | None = None
 
 
 class Model(FromRecipe, _ModelFields):
@@ -72,6 +83,8 @@ class Model(FromRecipe, _ModelFields):
         if t1 > t0; None: process_cov and measurement_cov are looked at
     returns_well: whether motion back in time loses no digits: over long intervals it grows as a
         polynomial (kinematic motion), not exponentially
+    sizes: how many components each sensor has, where they differ: values are as wide as the widest,
+        and what a sensor lacks is absent (see `models.components`)
     """
 
 
@@ -103,9 +116,11 @@ def linear_model(
     Args:
         F: function (params, t0, t1) -> (n, n), also for t1 < t0 where late data or smoothing need
             it; or for one step: (n, n), or a function of `params` alone.
-        H: function (params, sensor, t) -> (m, n); (m, n); a table (S, m, n); or a function of
-            `params` alone that gives one of these.
-        R: covariance of v, likewise: function, (m, m), (S, m, m), or function of `params` alone.
+        H: function (params, sensor, t) -> (m, n); (m, n); a table (S, m, n); a list of matrices
+            with as many rows as each sensor has components; or a function of `params` alone that
+            gives one of the first three.
+        R: covariance of v, likewise: function, (m, m), (S, m, m), list of matrices, or function of
+            `params` alone.
         Q: covariance of w, function (params, t0, t1) -> (n, n) for t1 >= t0; for one step (n, n) or
             a function of `params` alone; or None (no process noise).
         b: known input, function (params, t0, t1) -> (n,) for t1 >= t0; for one step (n,) or a
@@ -119,8 +134,8 @@ def linear_model(
 
     Raises:
         ValueError: a constant has the wrong shape, or a constant Q or R is not PSD; tables H and R
-            speak of different numbers of sensors; Q or b of one step beside an F that is a function
-            of (params, t0, t1).
+            speak of different numbers of sensors, or of components; Q or b of one step beside an F
+            that is a function of (params, t0, t1).
     """
     checks.require(
         checks.concrete_value(dt) is not None, "dt", "a number, not a parameter", "a tracer"
@@ -136,6 +151,9 @@ def linear_model(
         checks.psd("Q", Q)
     Q = constant("Q", Q, (n, n)) if is_discrete(Q) else Q and named(one_program(Q))
     b = constant("b", b, (n,)) if is_discrete(b) else named(b)
+    H, sizes_of_H = of_sizes("H", H, wider)
+    R, sizes_of_R = of_sizes("R", R, wider_cov)
+    sizes = same_sizes(sizes_of_H, sizes_of_R)
     H_given, R_varies = H, callable(R)
     H, rows = by_sensor("H", H)
     R, cols = by_sensor("R", R)
@@ -171,6 +189,7 @@ def linear_model(
         sensors=sensors,
         steps=moved.steps,
         check=check,
+        sizes=sizes,
     )
 
 

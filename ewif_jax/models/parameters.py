@@ -38,6 +38,19 @@ def of_params(value: Numbers) -> bool:
     return sum(one.kind in positional for one in found) == 1
 
 
+def with_time(value: Numbers) -> bool:
+    """Whether it is a function that cannot be asked without a time beside `params`."""
+    if not callable(value) or isinstance(value, itemgetter | attrgetter):
+        return False
+    try:
+        found = signature(value).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    needed = [one for one in found if one.kind in positional and one.default is Parameter.empty]
+    return len(needed) == 2
+
+
 def _is_named(value: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(value)
     def call(params: Params, *args: Any) -> Any:

@@ -16,6 +16,7 @@ from jax.extend.core import jaxpr_as_fun
 
 from ewif_jax import checks
 from ewif_jax.fast.memo import question_of, remembered
+from ewif_jax.models.components import check_components
 from ewif_jax.models.model import Model
 from ewif_jax.recipe import digest
 from ewif_jax.types import Measurement, Numbers, Params
@@ -38,8 +39,10 @@ def check_sensor(model: Model, params: Params, x: Numbers, sensor: Numbers, t: N
 
 
 def check_sensors(model: Model, params: Params, x: Numbers, measurements: Measurement) -> None:
-    """`check_sensor` of the largest known index of a whole stream."""
+    """`check_sensor` of the largest known index of a whole stream, and what each of its rows says
+    that its sensor does not have."""
     checks.sensors(measurements, model.sensors)
+    check_components(model, measurements)
     indices = checks.concrete_value(measurements.sensor)
     if indices is not None and indices.size:
         time = jnp.asarray(measurements.time).ravel()[0]

@@ -8,63 +8,127 @@ import numpy as np
 from jax import Array
 
 from ewif_jax import checks
-from ewif_jax.fast.compiling import array
-from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models import domain
-from ewif_jax.models.parameters import resolve
-from ewif_jax.models.tables import select
+from ewif_jax.models.parameters import resolve, with_time
+from ewif_jax.models.places import Place, place_of
 from ewif_jax.recipe import FromRecipe, from_recipe
 from ewif_jax.types import Parameter, Params
 
+Seen = Callable[..., Array]
+
 
 class _SensorFields(NamedTuple):
-    observe: Callable[..., Array]
-    cov: Callable[..., Array]
+    observe: Seen
+    cov: Seen
     angle: tuple[bool, ...]
     matrix: Callable[[int], np.ndarray] | None = None
+    offset: Seen | None = None
 
 
 class Sensor(FromRecipe, _SensorFields):
     """One sensor: observe(params, x, t) -> (m,), cov(params, t) -> (m, m), which of its m
-    components are angles, and matrix(n) -> (m, n) if it is linear."""
+    components are angles, and, if it is linear, matrix(n) -> (m, n) and offset(params, t) -> (m,)
+    (None: zero) of z = H x + offset."""
 
 
 @from_recipe
-def position_sensor(r: Parameter, dims: int = 1) -> Sensor:
+def sensor(
+    observe: Seen,
+    cov: Parameter,
+    size: int = 1,
+    angle: bool | Sequence[bool] | None = None,
+) -> Sensor:
+    r"""A sensor of your own, :math:`z = h(x, t) + v`.
+
+    Args:
+        observe: h, function (params, x, t) -> (size,) in the dtype of x, differentiable.
+        cov: of v: a variance, (size,) variances, (size, size), or a function of `params`, or of
+            (params, t), that gives one of these.
+        size: how many numbers it says.
+        angle: which of them are angles in radians, (size,) booleans, or one for all; None: none.
+            Their differences are wrapped into (-pi, pi].
+
+    Raises:
+        ValueError: a cov that is no covariance of `size` numbers, an angle of another length; when
+            it is used, an `observe` that gives another shape.
+    """
+    checks.require(callable(observe), "observe", "a function (params, x, t)", repr(observe))
+    m = checks.whole("size", size, 1)
+    flags = np.broadcast_to(angle, m) if isinstance(angle, bool | np.bool_) else angle
+    flags = np.zeros(m, bool) if flags is None else np.asarray(flags)
+    checks.require(flags.dtype == bool, "angle", f"{m} booleans", angle)
+    checks.shape("angle", flags, (m,))
+
+    def seen(params: Params, x: Array, t: Array) -> Array:
+        value = observe(params, x, t)
+        checks.shape("observe", value, (m,))
+        return value
+
+    return Sensor(seen, noise_cov("cov", cov, m), tuple(map(bool, flags)))
+
+
+@from_recipe
+def position_sensor(r: Parameter, dims: int = 1, position: Place = None) -> Sensor:
     """A sensor of the first `dims` state components (the position).
 
     Args:
-        r: noise variance in m^2, a number, a matrix (dims, dims), or a function of `params`.
+        r: noise variance in m^2, a number, (dims,) variances, a matrix (dims, dims), or a function
+            of `params`.
         dims: number of space dimensions.
+        position: of the sensor, from where it counts: (dims,), or a function (params, t) -> (dims,)
+            or of `params`; None: the origin.
     """
-    checks.whole("dims", dims, 1)
-
-    def observe(params: Params, x: Array, t: Array) -> Array:
-        return x[:dims]
-
-    return Sensor(observe, _sensor_covariance(r, dims), (False,) * dims, lambda n: np.eye(dims, n))
+    return _part_of_state(r, checks.whole("dims", dims, 1), 0, "position", position)
 
 
 @from_recipe
-def bearing_sensor(r: Parameter, position: Sequence[float] = (0.0, 0.0)) -> Sensor:
-    r"""A sensor of the direction to the target, :math:`\mathrm{atan2}(y - y_s, x - x_s)`, radians.
+def velocity_sensor(r: Parameter, dims: int = 1, velocity: Place = None) -> Sensor:
+    """A sensor of the `dims` state components after the position (the velocity).
 
     Args:
-        r: noise variance in rad^2, a number or a function of `params`.
-        position: (x_s, y_s) in m.
+        r: noise variance in (m/s)^2, a number, (dims,) variances, a matrix (dims, dims), or a
+            function of `params`.
+        dims: number of space dimensions.
+        velocity: of the sensor, to which it compares: (dims,), or a function (params, t) -> (dims,)
+            or of `params`; None: it stands still.
 
-    Deviations: Pornsarayouth & Yamakita (55) leaves the sensor position out. At the sensor itself
-    the bearing is undefined: 0 with a zero gradient.
+    Raises:
+        ValueError: a state without a velocity.
     """
-    checks.shape("position", position, (2,))
-    checks.finite("position", position)
+    m = checks.whole("dims", dims, 1)
+    return _part_of_state(r, m, m, "velocity", velocity)
+
+
+def _part_of_state(r: Parameter, m: int, first: int, argument: str, own: Place) -> Sensor:
+    """A sensor of m components of the state from `first` on, less its own."""
+    origin = None if own is None else place_of(argument, own, m)
 
     def observe(params: Params, x: Array, t: Array) -> Array:
-        east, north = x[0] - position[0], x[1] - position[1]
-        here = (east == 0) & (north == 0)
-        return jnp.arctan2(jnp.where(here, 0, north), jnp.where(here, 1, east))[None]
+        _need_components(first + m, x.shape[0])
+        seen = x[first : first + m]
+        return seen if origin is None else seen - origin(params, t, x.dtype)
 
-    return Sensor(observe, _sensor_covariance(r, 1), (True,))
+    def matrix(n: int) -> np.ndarray:
+        _need_components(first + m, n)
+        return np.eye(m, n, k=first)
+
+    def offset(params: Params, t: Array) -> Array:
+        assert origin is not None
+        return -origin(params, t, jnp.result_type(t, 0.0))
+
+    return Sensor(
+        observe,
+        noise_cov("r", r, m),
+        (False,) * m,
+        matrix,
+        None if origin is None else offset,
+    )
+
+
+def _need_components(needed: int, n: int) -> None:
+    checks.require(
+        n >= needed, "sensors", f"a state of at least {needed} components for this sensor", n
+    )
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -74,70 +138,25 @@ def wrap_angle(angle: Array) -> Array:
     return jnp.where(jnp.abs(wrapped) <= 4, wrapped, jnp.nan)
 
 
-def _sensor_covariance(r: Parameter, m: int) -> Callable[..., Array]:
+def noise_cov(argument: str, r: Parameter, m: int) -> Seen:
+    """cov(params, t) -> (m, m) of a variance, (m,) variances, (m, m), or a function of `params` or
+    (params, t) that gives one of these."""
     if not callable(r):
         if np.ndim(r) == 2:
-            checks.psd("r", r)
-            checks.shape("r", r, (m, m))
+            checks.psd(argument, r)
+            checks.shape(argument, r, (m, m))
         else:
-            domain.check_variance("r", r)
+            domain.check_variance(argument, r, (m,) if np.ndim(r) else ())
+    timed = with_time(r)
 
     def cov(params: Params, t: Array) -> Array:
-        value = resolve(r, params)
+        value: Any = r(params, t) if timed else resolve(r, params)
         if np.ndim(value) == 2:
-            checks.shape("r", value, (m, m))
-            return domain.covariance("r", value)
-        value = domain.floating(domain.variance("r", value, params))
+            checks.shape(argument, value, (m, m))
+            return domain.covariance(argument, value)
+        shape = (m,) if np.ndim(value) else ()
+        value = domain.floating(domain.variance(argument, value, params, shape))
         # NumPy's eye: JAX's is a program, compiled where something known is asked inside a trace.
-        return value * np.eye(m, dtype=value.dtype)
+        return (value[:, None] if shape else value) * np.eye(m, dtype=value.dtype)
 
     return cov
-
-
-def bank(
-    sensors: Sensor | Sequence[Sensor],
-) -> tuple[Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable | None, int]:
-    """observe, cov, residual and (if all are linear) matrix of sensors chosen by their index:
-    matrix(n) -> H(params, sensor, t), and where any H differs from zero.
-
-    All sensors must have the same number of components. Returns the count last.
-    """
-    group = (sensors,) if isinstance(sensors, Sensor) else tuple(sensors)
-    checks.require(len(group) > 0, "sensors", "at least one sensor", "none")
-    sizes = {len(s.angle) for s in group}
-    checks.require(len(sizes) == 1, "sensors", "equal numbers of components", sorted(sizes))
-    angles = np.asarray([s.angle for s in group])
-
-    def choose(values: list[Array], index: Array) -> Any:
-        if len(values) == 1:
-            return values[0]
-        is_concrete = not isinstance(index, Array) and not any(isinstance(x, Array) for x in values)
-        if not is_concrete:
-            return select(jnp.stack(values), index)
-        return np.stack(values)[np.minimum(index, len(values) - 1)]  # refused elsewhere, by name
-
-    def observe(params: Params, x: Array, sensor: Array, t: Array) -> Array:
-        return choose([s.observe(params, x, t) for s in group], sensor)
-
-    def cov(params: Params, sensor: Array, t: Array) -> Array:
-        return choose([s.cov(params, t) for s in group], sensor)
-
-    def residual(value: Array, predicted: Array, sensor: Array) -> Array:
-        difference = value - predicted
-        if not angles.any():
-            return difference
-        wrapped = wrap_angle(difference)
-        if angles.all():
-            return wrapped
-        return jnp.where(jnp.asarray(angles)[sensor], wrapped, difference)
-
-    matrices = [s.matrix for s in group]
-    if any(matrix is None for matrix in matrices):
-        return observe, cov, residual, None, len(group)
-
-    def matrix(n: int) -> tuple[Callable[..., Array], Pattern]:
-        matrices_here = [m(n) for m in matrices if m is not None]
-        table = [array(m) for m in matrices_here]
-        return (lambda params, sensor, t: choose(table, sensor)), pattern(*matrices_here)
-
-    return observe, cov, residual, matrix, len(group)

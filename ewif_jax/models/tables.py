@@ -1,5 +1,6 @@
 """Matrices that differ from sensor to sensor: what a table of them must be, and one looked up."""
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -42,6 +43,58 @@ def by_sensor(argument: str, x: Numbers) -> tuple[Any, int | None]:
         return matrices[min(sensor, len(matrices) - 1)] if is_number else select(table, sensor)
 
     return chosen, table.shape[0]
+
+
+def of_sizes(
+    argument: str, x: Numbers, pad: Callable[[Any, int], Any]
+) -> tuple[Any, tuple[int, ...] | None]:
+    """`x`, of a list of matrices with different numbers of rows a table as high as the highest, and
+    these numbers; None where they do not differ."""
+    if not isinstance(x, list | tuple) or any(np.ndim(matrix) != 2 for matrix in x):
+        return x, None
+    sizes = different([np.shape(matrix)[0] for matrix in x])
+    if sizes is None:
+        return x, None
+    for k, matrix in enumerate(x):
+        checks.finite(f"{argument}[{k}]", matrix)
+    same = len({np.shape(pad(matrix, max(sizes)))[1] for matrix in map(np.asarray, x)}) == 1
+    expected = "matrices with equally many columns" if argument == "H" else "square matrices"
+    checks.require(same, argument, expected, [np.shape(matrix) for matrix in x])
+    return np.stack([pad(np.asarray(matrix, float), max(sizes)) for matrix in x]), sizes
+
+
+def same_sizes(
+    rows: tuple[int, ...] | None, cols: tuple[int, ...] | None
+) -> tuple[int, ...] | None:
+    """How many components each sensor has by H and R of `of_sizes`."""
+    both = rows is not None and cols is not None
+    checks.require(not both or rows == cols, "R", f"as many components as H has, {rows}", f"{cols}")
+    return cols if rows is None else rows
+
+
+def different(sizes: Sequence[int]) -> tuple[int, ...] | None:
+    """`sizes`, or None where all are equal."""
+    return tuple(sizes) if len(set(sizes)) > 1 else None
+
+
+def wider(x: Numbers, m: int) -> Any:
+    """x (k, ...) with zeros up to (m, ...)."""
+    k = np.shape(x)[0]
+    if k == m:
+        return x
+    xp = jnp if isinstance(x, Array) else np
+    return xp.concatenate([x, xp.zeros((m - k, *np.shape(x)[1:]), x.dtype)])
+
+
+def wider_cov(cov: Numbers, m: int) -> Any:
+    """A covariance (k, k) with independent components of unit variance up to (m, m)."""
+    k = np.shape(cov)[0]
+    if k == m:
+        return cov
+    xp = jnp if isinstance(cov, Array) else np
+    inside = np.arange(m) < k
+    padded = xp.pad(cov, (0, m - k))
+    return xp.where(inside[:, None] & inside, padded, np.eye(m, dtype=padded.dtype))
 
 
 def _looked_up(argument: str, x: Numbers, params: Params, sensor: Array, t: Array) -> Array:

@@ -12,13 +12,20 @@ from ewif_jax import checks
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
     check_times,
     without_process_noise,
 )
-from ewif_jax.models.linearise import affine_flow, need_linear, need_reversible, observation
+from ewif_jax.models.linearise import (
+    affine_flow,
+    need_linear,
+    need_reversible,
+    observation,
+    predicted_value,
+)
 from ewif_jax.models.model import Model
 from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
@@ -91,9 +98,8 @@ def batch_wls(
         checks.require(t0 is not None, "t0", "the time of the prior", None)
         t0 = jnp.asarray(t0, dtype)
         prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
-    return _batch_wls(
-        model, params, cast(measurements, dtype), jnp.asarray(times, dtype), weight, prior, t0
-    )
+    seen = cast(existing(model, measurements), dtype)
+    return _batch_wls(model, params, seen, jnp.asarray(times, dtype), weight, prior, t0)
 
 
 @partial(jax.jit, static_argnames=("model", "weight"))
@@ -119,7 +125,9 @@ def _batch_wls(
         H, R = observation(model, params, measurement.sensor, measurement.time, dtype)
         checks.shape("measurement.value", measurement.value, (H.shape[0],))
         A, c = affine_flow(model, params, time, measurement.time, dtype)
-        offset_seen = jnp.zeros(H.shape[0], dtype) if c is None else dense(H) @ c
+        still = jnp.zeros(dense(H).shape[1], dtype) if c is None else c
+        sensor, stamp = measurement.sensor, measurement.time
+        offset_seen = predicted_value(model, params, H, still, sensor, stamp)
         target = model.residual(measurement.value, offset_seen, measurement.sensor)
         rows = jnp.where(measurement.mask[:, None], jnp.c_[dense(H) @ dense(A), target], 0)
         noise = cholesky.factor(gaussian.mask_cov(R, measurement.mask))

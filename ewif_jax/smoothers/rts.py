@@ -10,6 +10,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.linearise import need_model
 from ewif_jax.models.model import Model
@@ -93,7 +94,7 @@ def rts(
     dtype = float_dtype(measurements.value)
     check_times(model, measurements, t0, dtype, in_order=False)
     check_covariances_of(model, params, t0, measurements.time, measurements.sensor)
-    measurements = cast(measurements, dtype)
+    measurements = cast(existing(model, measurements), dtype)
     times, begin = checks.concrete_value(measurements.time), checks.concrete_value(t0)
     if times is not None and begin is not None:
         early = float(times.min())

@@ -9,6 +9,7 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.kernels.growth import decayed, exponential
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -90,7 +91,8 @@ def two_sided_ewif(
         t0 = jnp.asarray(t0, dtype)
         prior = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
     decay = jnp.asarray(decay, dtype).reshape(())
-    return _two_sided(model, params, cast(measurements, dtype), decay, prior, t0, times)
+    seen = cast(existing(model, measurements), dtype)
+    return _two_sided(model, params, seen, decay, prior, t0, times)
 
 
 @partial(jax.jit, static_argnames="model")

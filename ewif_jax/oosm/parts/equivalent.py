@@ -11,6 +11,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model, predict_measurement, predict_state
+from ewif_jax.models.linearise import predicted_value
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared
 from ewif_jax.types import Measurement, Params, State
@@ -68,7 +69,8 @@ def tied_to_start(
     spread = matmul(symmetric.rows(left, cov), left.T) + matmul(matmul(weights, Q), weights.T)
     # A plain update in sequence, to the last digit: there M adds nothing but its rounding.
     late = time < now
-    value = jnp.where(late, value, matvec(H, state.mean))
+    seen_now = predicted_value(model, params, H, state.mean, measurement.sensor, measurement.time)
+    value = jnp.where(late, value, seen_now)
     difference = model.residual(measurement.value, value, measurement.sensor)
     H, R = jnp.where(late, weights, dense(H)), jnp.where(late, R + spread, R)
     return Compared(difference, H, R, measurement.mask), True
