@@ -13,6 +13,7 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.estimators.ewif import ewif, growth
 from ewif_jax.models.components import check_components
+from ewif_jax.models.linearise import need_known_noise
 from ewif_jax.models.model import Model
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions import passage as way
@@ -69,6 +70,7 @@ def run_parallel(
     is_method = method in ("blocked", "associative")
     checks.require(is_method, "method", "'blocked' or 'associative'", repr(method))
     estimator = ewif(model, tau, weight=weight)
+    need_known_noise(model, "run_parallel")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_components(model, measurements)
     validated(estimator, params, measurements, prior, t0, times, "validity", None)

@@ -12,6 +12,7 @@ from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.models import Model
 from ewif_jax.models.components import check_components, existing
+from ewif_jax.models.linearise import noise_at
 from ewif_jax.streams import cast, checked_stream, float_dtype
 from ewif_jax.types import Measurement, Numbers, Params, State
 
@@ -120,7 +121,8 @@ def _bound_along(
             there = model.transition(params, x, time, measurement.time)
             return jnp.asarray(model.observe(params, there, sensor, measurement.time), state.dtype)
 
-        R = jnp.asarray(model.measurement_cov(params, sensor, measurement.time), state.dtype)
+        there = jnp.asarray(model.transition(params, state, time, measurement.time), state.dtype)
+        R = noise_at(model, params, there, sensor, measurement.time)
         noise = cholesky.factor(gaussian.mask_cov(R, mask))
         white = cholesky.forward(noise, jnp.where(mask[:, None], jax.jacfwd(seen)(state), 0))
         w = 1.0 if weight is None else weight(params, measurement.time, time)

@@ -9,7 +9,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models.entry import without_process_noise
-from ewif_jax.models.linearise import need_linear, need_reversible
+from ewif_jax.models.linearise import need_known_noise, need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
@@ -56,6 +56,7 @@ def limited_memory(model: Model, window: Parameter, capacity: int) -> Estimator:
     """
     linear = need_linear(model, "limited_memory")
     need_reversible(model, "limited_memory")
+    need_known_noise(model, "limited_memory")
     checks.whole("capacity", capacity, 1)
     if not callable(window):
         checks.positive_number("window", window)

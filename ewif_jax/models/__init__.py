@@ -2,6 +2,7 @@
 
 from ewif_jax.models.continuous_time import from_continuous
 from ewif_jax.models.coordinated_turn import coordinated_turn
+from ewif_jax.models.imperfect import biased, jittered
 from ewif_jax.models.kinematic import (
     constant_acceleration,
     constant_velocity,
@@ -33,10 +34,12 @@ __all__ = [
     "affine_flow",
     "azimuth_elevation_range_sensor",
     "bearing_sensor",
+    "biased",
     "constant_acceleration",
     "constant_velocity",
     "coordinated_turn",
     "from_continuous",
+    "jittered",
     "linear_model",
     "observation",
     "position_sensor",

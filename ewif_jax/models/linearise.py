@@ -37,7 +37,7 @@ def predict_measurement(
 ) -> tuple[Array, Array | Matrix, Array]:
     """Predicted measurement (m,), its Jacobian H (m, n) at x, and R (m, m)."""
     check_sensor(model, params, x, sensor, t)
-    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
+    R = noise_at(model, params, x, sensor, t)
     if model.linear is not None:
         H = with_zeros(
             jnp.asarray(model.linear.H(params, sensor, t), x.dtype), model.linear.H_where
@@ -64,6 +64,12 @@ def affine_flow(
     linear = need_linear(model, "this operation")
     F, c = affine(linear.F, linear.b, params, t0, t1, dtype)
     return with_zeros(F, linear.F_where), c
+
+
+def noise_at(model: Model, params: Params, x: Array, sensor: Array, t: Array) -> Array:
+    """R (m, m) of a measurement that is predicted from the state x (n,)."""
+    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
+    return R if model.jitter is None else R + model.jitter(params, x, sensor, t)
 
 
 def predicted_value(
@@ -110,6 +116,17 @@ def need_linear(model: Model, method: str) -> Linear:
     )
     assert model.linear is not None
     return model.linear
+
+
+def need_known_noise(model: Model, method: str) -> None:
+    """Refuses a model whose R depends on the state, for a method that needs it before there is an
+    estimate."""
+    checks.require(
+        model.jitter is None,
+        "model",
+        f"a model whose R does not depend on the state: {method} needs it before there is one",
+        "a jittered model",
+    )
 
 
 def need_reversible(model: Model, method: str) -> Model:

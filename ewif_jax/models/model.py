@@ -66,6 +66,7 @@ class _ModelFields(NamedTuple):
     check: Callable[..., None] | None = None
     returns_well: bool = False
     sizes: tuple[int, ...] | None = None
+    jitter: Callable[..., Array] | None = None
 
 
 class Model(FromRecipe, _ModelFields):
@@ -85,6 +86,8 @@ class Model(FromRecipe, _ModelFields):
         polynomial (kinematic motion), not exponentially
     sizes: how many components each sensor has, where they differ: values are as wide as the widest,
         and what a sensor lacks is absent (see `models.components`)
+    jitter: jitter(params, x, sensor, t) -> (m, m), noise beside measurement_cov that depends on the
+        predicted state (see `models.jittered`)
     """
 
 
@@ -211,5 +214,9 @@ def affine(
     matrix = jnp.asarray(F(params, t0, t1), dtype)
     if b is None:
         return matrix, None
-    ahead = jnp.asarray(b(params, jnp.minimum(t0, t1), jnp.maximum(t0, t1)), dtype)
-    return matrix, jnp.where(t1 >= t0, ahead, -matvec(matrix, ahead))
+    forwards = t1 >= t0
+    # Not the minimum and the maximum, which share the derivative between equal times: that in t1 at
+    # t0 is the rate of the state (`models.jittered`).
+    start, end = jnp.where(forwards, t0, t1), jnp.where(forwards, t1, t0)
+    ahead = jnp.asarray(b(params, start, end), dtype)
+    return matrix, jnp.where(forwards, ahead, -matvec(matrix, ahead))

@@ -94,7 +94,7 @@ def look_back(
     """
     ahead = form.transported(model, params, last.particles, last.time, now)
     f = cholesky.factor(jnp.asarray(model.process_cov(params, last.time, now), ahead.dtype))
-    found = weighing.compared_cloud(model, params, last.fixed, measurement)
+    found = weighing.compared_cloud(model, params, last.fixed, last.log_weights, measurement)
     line_density = weighing.log_density(found, measurement.mask)
     line_weights = weighing.shares(last.log_weights, found.numbers)
     origin = weighing.stand_in(model, params, found.numbers, last.fixed, line_weights, measurement)

@@ -10,7 +10,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import Matrix, elementwise
 from ewif_jax.kernels import cholesky
 from ewif_jax.models import Model
-from ewif_jax.models.linearise import affine_flow, observation, predicted_value
+from ewif_jax.models.linearise import affine_flow, noise_at, observation, predicted_value
 from ewif_jax.types import Measurement, Params
 
 
@@ -39,6 +39,8 @@ def sight(
     A = still_at_once(A, measurement.time == now)
     there = matvec(A, mean)
     there = there if c is None else there + c
+    if model.jitter is not None:
+        R = noise_at(model, params, there, measurement.sensor, measurement.time)
     predicted = predicted_value(model, params, H, there, measurement.sensor, measurement.time)
     difference = model.residual(measurement.value, predicted, measurement.sensor)
     seen = jnp.where(mask[:, None], matmul(H, A), 0)

@@ -12,7 +12,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.linearise import predict_state
+from ewif_jax.models.linearise import noise_at, predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.covariance import measure, unseen
@@ -66,7 +66,7 @@ def view(
 ) -> tuple[Callable[[Array], Array], Array]:
     """What the sensor sees as a function of a state (n,), and R (m, m); refuses a bad sensor."""
     check_sensor(model, params, x, sensor, t)
-    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
+    R = noise_at(model, params, x, sensor, t)
     return lambda x: jnp.asarray(model.observe(params, x, sensor, t), x.dtype), R
 
 

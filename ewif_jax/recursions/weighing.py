@@ -12,6 +12,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.resampling import effective_sample_size
 from ewif_jax.models import Model
+from ewif_jax.models.linearise import noise_at
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.recursions.particles import weighted_moments
 from ewif_jax.types import Info, Measurement, Params, State, Status
@@ -51,7 +52,7 @@ def look_of_cloud(
 
     A component without noise (singular R) cannot weigh particles: no density is a number then.
     """
-    found = compared_cloud(model, params, particles, measurement)
+    found = compared_cloud(model, params, particles, log_weights, measurement)
     density = log_density(found, measurement.mask)
     innovation, spread = averaged_innovation(
         model, params, particles, found.predicted, found.numbers, log_weights, measurement
@@ -79,12 +80,12 @@ def averaged_innovation(
 
 
 def compared_cloud(
-    model: Model, params: Params, particles: Array, measurement: Measurement
+    model: Model, params: Params, particles: Array, log_weights: Array, measurement: Measurement
 ) -> ComparedCloud:
     """The measurement beside what particles (n, N) at its time predict."""
     time, value, sensor, mask = measurement
     check_sensor(model, params, particles[:, 0], sensor, time)
-    R = jnp.asarray(model.measurement_cov(params, sensor, time), particles.dtype)
+    R = _noise_of_cloud(model, params, particles, log_weights, measurement)
     checks.shape("measurement.value", value, (R.shape[0],))
 
     def predict_value(x: Array) -> Array:
@@ -99,6 +100,18 @@ def compared_cloud(
     R = gaussian.mask_cov(R, mask)
     difference = jnp.where(numbers, difference, 0)
     return ComparedCloud(predicted, difference, numbers, R, cholesky.factor(R))
+
+
+def _noise_of_cloud(
+    model: Model, params: Params, particles: Array, log_weights: Array, measurement: Measurement
+) -> Array:
+    """R (m, m), of the mean particle where it depends on the state: one for all of them."""
+    middle = particles[:, 0]
+    if model.jitter is not None:
+        finite = jnp.all(jnp.isfinite(particles), 0)
+        weights = shares(log_weights, finite)
+        middle = matmul(jnp.where(finite, particles, 0), weights[:, None])[:, 0]
+    return noise_at(model, params, middle, measurement.sensor, measurement.time)
 
 
 def log_density(found: ComparedCloud, mask: Array) -> Array:

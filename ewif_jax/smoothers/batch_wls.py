@@ -21,6 +21,7 @@ from ewif_jax.models.entry import (
 )
 from ewif_jax.models.linearise import (
     affine_flow,
+    need_known_noise,
     need_linear,
     need_reversible,
     observation,
@@ -81,6 +82,7 @@ def batch_wls(
     """
     need_linear(model, "batch_wls")
     need_reversible(model, "batch_wls")
+    need_known_noise(model, "batch_wls")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     checks.require(times is not None, "times", "when to estimate, (K,) seconds", None)
     check_sensors(model, params, None, measurements)

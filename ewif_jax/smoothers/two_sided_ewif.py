@@ -16,7 +16,7 @@ from ewif_jax.models.entry import (
     check_times,
     without_process_noise,
 )
-from ewif_jax.models.linearise import need_linear, need_reversible
+from ewif_jax.models.linearise import need_known_noise, need_linear, need_reversible
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensors
 from ewif_jax.models.steps import whole_steps
@@ -71,6 +71,7 @@ def two_sided_ewif(
     """
     need_linear(model, "two_sided_ewif")
     need_reversible(model, "two_sided_ewif")
+    need_known_noise(model, "two_sided_ewif")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_sensors(model, params, None, measurements)
     decay = checks.positive_number("tau", resolve(tau, params))

@@ -100,7 +100,8 @@ CHANGES: tuple[Change, ...] = (
         Change(n, f, make, REFUSED)
         for f in (*_ARRAYS, "sensor", "mask", *_NUMBERS)
         for n, make in BAD
-        if (f, n) not in (("tau", "infinity"), ("tau", "one axis more"))  # no decay; one number
+        # No decay; one number; one variance, of one component.
+        if (f, n) not in (("tau", "infinity"), ("tau", "one axis more"), ("r", "one axis more"))
     ),
     *(Change(n, f, make, REFUSED) for f in (*_ARRAYS, "sensor", "mask") for n, make in LESS),
     *(Change("whole numbers", f, lambda x: np.ones(np.shape(x), int), np.ones(np.shape(CLEAN[f]))) for f in ("value", "mean")),
