@@ -40,6 +40,7 @@ from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.ewif_bank import bank_weights, ewif_bank
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
+from ewif_jax.estimators.gated import gated
 from ewif_jax.estimators.information import information
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
@@ -147,6 +148,7 @@ __all__ = [
     "fixed_lag_ewif",
     "forecast",
     "gain_history",
+    "gated",
     "information",
     "kalman",
     "kalman_bucy",

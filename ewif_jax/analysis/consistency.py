@@ -8,7 +8,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
-from ewif_jax.kernels import cholesky
+from ewif_jax.kernels import gaussian
 from ewif_jax.types import Info
 
 
@@ -82,11 +82,4 @@ def _quadratic_form(error: Array, cov: Array) -> Array:
     lead = error.shape[:-1]
     flat = error.reshape(-1, error.shape[-1])
     matrices = cov.reshape(-1, *cov.shape[-2:])
-
-    def one_ratio(error: Array, cov: Array) -> Array:
-        all_finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(cov))
-        safe = jnp.where(all_finite, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
-        white = cholesky.forward(cholesky.factor(safe), jnp.where(all_finite, error, 0))
-        return jnp.where(all_finite, white @ white, jnp.nan)
-
-    return jax.vmap(one_ratio)(flat, matrices).reshape(lead)
+    return jax.vmap(gaussian.squared_distance)(flat, matrices).reshape(lead)

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax import checks
@@ -163,7 +164,7 @@ def bank_weights(state: BankState) -> Array:
 
 def _check_taus(taus: Parameter) -> Any:
     checks.shape("taus", taus, ("K",))
-    checks.require(jnp.shape(taus)[0] > 0, "taus", "at least one decay time", "none")
+    checks.require(np.shape(taus)[0] > 0, "taus", "at least one decay time", "none")
     checks.positive("taus", taus)
     return taus
 

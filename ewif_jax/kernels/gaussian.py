@@ -64,6 +64,15 @@ def log_density(innovation: Innovation, mask: Array) -> Array:
     return -0.5 * (jnp.sum(jnp.square(white)) + count * jnp.log(2 * jnp.pi)) - half_log_det
 
 
+def squared_distance(error: Array, cov: Array) -> Array:
+    """error' cov^-1 error () of error (m,) and cov (m, m), over the directions whose variance is
+    not zero; NaN where either is not finite."""
+    all_finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(cov))
+    safe = jnp.where(all_finite, cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
+    white = cholesky.forward(cholesky.factor(safe), jnp.where(all_finite, error, 0))
+    return jnp.where(all_finite, white @ white, jnp.nan)
+
+
 def gain(innovation: Innovation) -> Array:
     """K = P H' S^-1, (n, m)."""
     return cholesky.solve(innovation.factor, innovation.cross).T

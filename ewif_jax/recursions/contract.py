@@ -174,6 +174,20 @@ def offered(
     return updated, info._replace(delay=state.time - measurement.time, status=status)
 
 
+def let_through(inside: Array, state: State, updated: State, info: Info) -> tuple[Any, Info]:
+    """The update of `state`, unless a gate says that it is not `inside`: then the state as it was,
+    `REJECTED`, with the innovation and covariance that the gate judged."""
+    likelihood = jnp.where(inside, info.log_likelihood, 0)
+    status = jnp.where(inside, info.status, jnp.int32(Status.REJECTED))
+    info = info._replace(log_likelihood=likelihood, status=status)
+    return choose(inside, updated, state), info
+
+
+def is_used(info: Info) -> Array:
+    """Whether a measurement has been used, late or not, () bool."""
+    return (info.status == Status.USED) | (info.status == Status.LATE_USED)
+
+
 def _floating_time(t0: Numbers) -> Array:
     t0 = jnp.asarray(t0)
     return t0 if jnp.issubdtype(t0.dtype, jnp.floating) else t0.astype(float)

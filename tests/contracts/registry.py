@@ -32,7 +32,15 @@ from ewif_jax.oosm.selective import selective
 from ewif_jax.smoothers.fixed_lag import fixed_lag
 from ewif_jax.smoothers.fixed_lag_ewif import fixed_lag_ewif
 
-PARAMS = {"q": 0.3, "r": 0.5, "tau": 1.5, "fading": 1.1, "window": 2.45, "max_delay": 0.77}
+PARAMS = {
+    "q": 0.3,
+    "r": 0.5,
+    "tau": 1.5,
+    "fading": 1.1,
+    "window": 2.45,
+    "max_delay": 0.77,
+    "probability": 0.99999,
+}
 LAG = 4
 T0 = 0.0
 STEPS = 12
@@ -169,6 +177,12 @@ ROWS = (
         lambda model: drop_late(ej.ewif(model, of("tau"))),
         accepts_no_prior=True,
         predicts_back=True,
+    ),
+    Row(
+        "gated",
+        lambda model: ej.gated(al1(model, LAG), of("probability")),
+        late=Status.LATE_USED,
+        refuses="al1",
     ),
     Row("fixed_lag", lambda model: fixed_lag(model, 2)),
     Row("bootstrap", lambda model: bootstrap(model, 64), needs_key=True, differentiable=False),

@@ -53,7 +53,14 @@ class World(NamedTuple):
     def params(self) -> dict[str, float]:
         """Of every estimator of the registry."""
         lengths = {"window": 6.5 * self.dt, "max_delay": 5.0 * self.dt}
-        return {"q": 1.0, "r": self.r, "tau": self.tau, "fading": 1.1, **lengths}
+        return {
+            "q": 1.0,
+            "r": self.r,
+            "tau": self.tau,
+            "fading": 1.1,
+            "probability": 0.99999,
+            **lengths,
+        }
 
 
 WORLDS = {
