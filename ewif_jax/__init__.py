@@ -44,6 +44,7 @@ from ewif_jax.estimators.gated import gated
 from ewif_jax.estimators.information import information
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
+from ewif_jax.estimators.robust import robust
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
@@ -179,6 +180,7 @@ __all__ = [
     "replay",
     "rmse",
     "rmse_loss",
+    "robust",
     "rts",
     "rts_reference",
     "run",

@@ -40,6 +40,7 @@ PARAMS = {
     "window": 2.45,
     "max_delay": 0.77,
     "probability": 0.99999,
+    "c": 2.5,
 }
 LAG = 4
 T0 = 0.0
@@ -183,6 +184,21 @@ ROWS = (
         lambda model: ej.gated(al1(model, LAG), of("probability")),
         late=Status.LATE_USED,
         refuses="al1",
+    ),
+    Row(
+        "robust",
+        lambda model: ej.robust(ej.ewif(model, of("tau")), of("c")),
+        late=Status.LATE_USED,
+        any_age=True,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
+    Row(
+        "robust_asd",
+        lambda model: ej.robust(asd(model, LAG), of("c"), "student"),
+        late=Status.LATE_USED,
+        refuses="asd",
+        variant=True,
     ),
     Row("fixed_lag", lambda model: fixed_lag(model, 2)),
     Row("bootstrap", lambda model: bootstrap(model, 64), needs_key=True, differentiable=False),

@@ -122,6 +122,7 @@ def problem(seed: int, n: int, m: int, sensors: int, steps: int, dtype: Any) -> 
         "fading": rng.uniform(1, 1.2),
         "max_delay": rng.uniform(0.1, 2),
         "probability": 0.999,
+        "c": 3.0,
     }
     prior = ej.Gaussian(rng.normal(size=n), _covariance(rng, n, traits["P"], -2, 2))
     gap = rng.uniform(0.05, 1.0, steps) if traits["times"] != "regular" else np.full(steps, 0.5)

@@ -59,6 +59,7 @@ class World(NamedTuple):
             "tau": self.tau,
             "fading": 1.1,
             "probability": 0.99999,
+            "c": 3.0,
             **lengths,
         }
 
