@@ -8,6 +8,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels import gaussian
 from ewif_jax.models import resolve
+from ewif_jax.models.linearise import noise_at
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.noisier import (
     Noisy,
@@ -118,8 +119,10 @@ def robust(estimator: Estimator, c: Parameter, kind: Kind = "weight") -> Estimat
 
     def update(params: Params, state: State, measurement: Measurement) -> tuple[Any, Info]:
         _, info = estimator.update(params, state, measurement)
-        R = model.measurement_cov(params, measurement.sensor, measurement.time)
-        R = jnp.asarray(R, info.innovation.dtype)
+        # Of stamps that are uncertain the noise depends on the state: here on that of now, since a
+        # filter need not be able to go back to the time of what is late.
+        x = state.time[None] if model.jitter is None else estimator.estimate(params, state).mean
+        R = noise_at(model, params, x, measurement.sensor, measurement.time)
         scale = jnp.asarray(checks.positive_number("c", resolve(c, params)), R.dtype).reshape(())
         factor = _noise_factor(kind, scale, info.innovation, R, measurement.mask)
         updated, used = inside.update(Noisy(params, factor), state, measurement)

@@ -54,10 +54,8 @@ def _given_noisy(x: Any) -> Any:
     return _of_params_inside(x) if callable(x) else x
 
 
-def _of_params_inside(function: Callable[..., Any] | None) -> Any:
+def _of_params_inside(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of (params, ...) as one of (Noisy, ...)."""
-    if function is None:
-        return None
 
     @wraps(function)
     def called(noisy: Noisy, *args: Any) -> Any:
@@ -68,18 +66,25 @@ def _of_params_inside(function: Callable[..., Any] | None) -> Any:
 
 @from_recipe
 def _noisier_model(model: Model) -> Model:
-    def measurement_cov(noisy: Noisy, sensor: Array, t: Array) -> Array:
-        return domain.scaled(noisy.factor, model.measurement_cov(noisy.params, sensor, t))
+    def scaled(cov: Callable[..., Array]) -> Callable[..., Array]:
+        def covariance(noisy: Noisy, *args: Any) -> Array:
+            return domain.scaled(noisy.factor, cov(noisy.params, *args))
+
+        return covariance
 
     linear = model.linear
     if linear is not None:
-        F, b, H = map(_of_params_inside, linear[:3])
-        linear = linear._replace(F=F, b=b, H=H)
+        linear = linear._replace(**_functions_inside(linear))
     return model._replace(
-        transition=_of_params_inside(model.transition),
-        process_cov=_of_params_inside(model.process_cov),
-        observe=_of_params_inside(model.observe),
-        measurement_cov=measurement_cov,
+        **_functions_inside(model, "residual"),
+        measurement_cov=scaled(model.measurement_cov),
+        jitter=None if model.jitter is None else scaled(model.jitter),
         linear=linear,
-        check=_of_params_inside(model.check),
     )
+
+
+def _functions_inside(fields: Any, *kept: str) -> dict[str, Any]:
+    """The functions of `params` in a named tuple as functions of `Noisy`."""
+    kept = (*kept, "measurement_cov", "jitter", "linear")
+    every = fields._asdict().items()
+    return {k: _of_params_inside(f) for k, f in every if callable(f) and k not in kept}

@@ -236,6 +236,22 @@ def test_a_batch_is_its_runs_and_nothing_known_is_no_outlier():
     np.testing.assert_array_equal(both.info.log_likelihood[0][unknown], 0)
 
 
+def test_offsets_and_jitter_of_a_model_stay_what_they_are():
+    """A velocity of 3 m/s and stamps uncertain by 0.5 s are noise of 1.5 m; a bias is none."""
+    sensor = ej.models.biased(ej.models.position_sensor(1.0), lambda p: p["bias"])
+    exact = ej.models.constant_velocity(sensors=sensor, q=0.1)
+    wide = ej.models.constant_velocity(sensors=ej.models.position_sensor(1.0 + 1.5**2), q=0.1)
+    prior = ej.Gaussian(np.array([1.0, 3.0]), np.diag([2.0, 0.5]))
+    params = {"bias": jnp.asarray(20.0)}
+    for kind in KINDS:
+        found, wanted = (
+            go(ej.robust(ej.kalman(model), C, kind), ej.stream([0.0], [[z]]), params, prior)
+            for model, z in ((ej.models.jittered(exact, 0.5), 27.0), (wide, 7.0))
+        )
+        np.testing.assert_allclose(found.mean, wanted.mean, rtol=1e-12)
+        np.testing.assert_allclose(found.cov, wanted.cov, rtol=1e-12)
+
+
 def test_equal_ones_are_equal():
     def make():
         return ej.robust(ej.replay(ej.kalman(GIVEN.model), 3), 2.0)
