@@ -58,6 +58,7 @@ from ewif_jax.losses import (
     rmse_loss,
 )
 from ewif_jax.models import Model, linear_model
+from ewif_jax.models.inputs import inputs
 from ewif_jax.monte_carlo import (
     Scenario,
     Simulation,
@@ -151,6 +152,7 @@ __all__ = [
     "gain_history",
     "gated",
     "information",
+    "inputs",
     "kalman",
     "kalman_bucy",
     "likelihood_loss",

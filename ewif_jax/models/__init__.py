@@ -3,6 +3,7 @@
 from ewif_jax.models.continuous_time import from_continuous
 from ewif_jax.models.coordinated_turn import coordinated_turn
 from ewif_jax.models.imperfect import biased, jittered
+from ewif_jax.models.inputs import Inputs
 from ewif_jax.models.kinematic import (
     constant_acceleration,
     constant_velocity,
@@ -28,6 +29,7 @@ from ewif_jax.models.ranging import (
 from ewif_jax.models.sensors import Sensor, position_sensor, sensor, velocity_sensor, wrap_angle
 
 __all__ = [
+    "Inputs",
     "Linear",
     "Model",
     "Sensor",

@@ -14,6 +14,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.models import domain
 from ewif_jax.models.bank import Bank, bank
 from ewif_jax.models.discrete import pattern_of_powers
+from ewif_jax.models.inputs import driven, need_both
 from ewif_jax.models.model import Linear, Model, affine_motion, linear_model
 from ewif_jax.models.parameters import named
 from ewif_jax.models.powers import Stride, both_strides
@@ -37,6 +38,8 @@ def from_continuous(
     H: Parameter = None,
     R: Parameter = None,
     b: Parameter = None,
+    B: Parameter = None,
+    u: Parameter = None,
 ) -> Model:
     r"""The linear model of :math:`dx = (A x + b)\,dt + G\,dw` over any interval, also backwards.
 
@@ -57,6 +60,9 @@ def from_continuous(
         sensors: one or several linear `Sensor`; a measurement's `sensor` chooses. Or:
         H, R: as in `linear_model`.
         b: a constant input per second (n,), or a function of `params`; or None.
+        B, u: how an input drives the state, dx = (A x + b + B u) dt: (n, k) or a function of
+            `params`, and `inputs(times, values)` or a function of `params` that gives them,
+            integrated exactly; or None.
 
     Differentiable in A, G, intensity, b, and in the times.
 
@@ -73,10 +79,9 @@ def from_continuous(
         "either sensors or both H and R",
         "both" if sensors is not None else "neither",
     )
-    A, G, intensity, b = (
-        _given_matrix(argument, x)
-        for argument, x in (("A", A), ("G", G), ("intensity", intensity), ("b", b))
-    )
+    need_both(B, u)
+    named_here = (("A", A), ("G", G), ("intensity", intensity), ("b", b), ("B", B))
+    A, G, intensity, b, B = (_given_matrix(argument, x) for argument, x in named_here)
     F_where = None
     if isinstance(A, np.ndarray):
         checks.shape("A", A, (len(A), len(A)))
@@ -85,6 +90,8 @@ def from_continuous(
             checks.shape("G", G, (len(A), "k"))
         if isinstance(b, np.ndarray):
             checks.shape("b", b, (len(A),))
+        if isinstance(B, np.ndarray):
+            checks.shape("B", B, (len(A), "k"))
     if isinstance(intensity, np.ndarray):
         checks.psd("intensity", _squared_up(intensity, np))
 
@@ -119,7 +126,15 @@ def from_continuous(
         checks.shape("b", push, drift.shape[:1])
         return integrated(drift, dt, push=jnp.where(t1 < t0, -push, push))[2]
 
+    def response(params: Params, t0: Array, t1: Array) -> Array:
+        drift, dt = drift_over(params, t0, t1)
+        pushes = _matrix_value(B, params).astype(drift.dtype)
+        checks.shape("B", pushes, (drift.shape[0], "k"))
+        return jax.vmap(lambda push: integrated(drift, dt, push=push)[2], 1, 1)(pushes)
+
     offset = None if b is None else gathered
+    if u is not None:
+        offset = driven(F, response, u, offset)
     if sensors is None:
         seen = linear_model(F, H, R, b=offset)
     else:

@@ -56,19 +56,20 @@ def pattern_of_powers(F: Parameter) -> Pattern | None:
 
 
 class Motion(NamedTuple):
-    """F, Q and b as functions of (params, t0, t1) (Q and b may be None), how time is counted (None:
-    any interval is right), and whether F can be asked to go back."""
+    """F, Q, b and B as functions of (params, t0, t1) (all but F may be None), how time is counted
+    (None: any interval is right), and whether F can be asked to go back."""
 
     F: Function
     Q: Function | None
     b: Function | None
+    B: Function | None
     steps: Steps | None
     reversible: bool
 
 
-def motion(F: Parameter, Q: Parameter, b: Parameter, steps: Steps) -> Motion:
-    """What F, Q and b of one step, or of intervals, say of any interval."""
-    for argument, value in (("Q", Q), ("b", b)):
+def motion(F: Parameter, Q: Parameter, b: Parameter, B: Parameter, steps: Steps) -> Motion:
+    """What F, Q, b and B of one step, or of intervals, say of any interval."""
+    for argument, value in (("Q", Q), ("b", b), ("B", B)):
         checks.require(
             is_discrete(F) or not is_discrete(value),
             argument,
@@ -77,14 +78,15 @@ def motion(F: Parameter, Q: Parameter, b: Parameter, steps: Steps) -> Motion:
             "a function of params alone" if callable(value) else "a constant",
         )
     if not is_discrete(F):
-        return Motion(F, Q, b, None, True)
+        return Motion(F, Q, b, B, None, True)
     stands = isinstance(F, np.ndarray) and np.array_equal(F, np.eye(F.shape[0]))
-    if stands and not is_discrete(Q) and not is_discrete(b):
-        return Motion(lambda params, t0, t1: jnp.asarray(F), Q, b, None, True)
+    if stands and not any(map(is_discrete, (Q, b, B))):
+        return Motion(lambda params, t0, t1: jnp.asarray(F), Q, b, B, None, True)
     return Motion(
         transition_of_steps(F, steps),
         noise_of_steps(F, Q, steps) if is_discrete(Q) else Q,
         input_of_steps(F, b, steps) if is_discrete(b) else b,
+        response_of_steps(F, B, steps) if is_discrete(B) else B,
         steps,
         full_rank(F),
     )
@@ -152,6 +154,30 @@ def input_of_steps(F: Parameter, b: Parameter, steps: Steps) -> Function:
         )
 
     return gathered
+
+
+def response_of_steps(F: Parameter, B: Parameter, steps: Steps) -> Function:
+    """What a constant unit input does from t0 to t1 >= t0 (n, k), as a function of (params, t0,
+    t1)."""
+    if isinstance(B, np.ndarray):
+        columns = [input_of_steps(F, column, steps) for column in B.T]
+
+        def known(params: Params, t0: Array, t1: Array) -> Array:
+            return jnp.stack([column(params, t0, t1) for column in columns], 1)
+
+        return known
+
+    def read(params: Params, t0: Array, t1: Array) -> Array:
+        first = _first_step("B", B, params, ("n", "k"))
+        columns = [input_of_steps(F, partial(_same_column, x), steps) for x in first.T]
+        return jnp.stack([column(params, t0, t1) for column in columns], 1)
+
+    return read
+
+
+def _same_column(column: Array, params: Params) -> Array:
+    del params
+    return column
 
 
 def noise_of_steps(F: Parameter, Q: Parameter, steps: Steps) -> Function:

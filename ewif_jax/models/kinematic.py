@@ -17,6 +17,7 @@ from ewif_jax.fast.batched import kernel
 from ewif_jax.fast.sparse import Pattern, pattern
 from ewif_jax.models import domain
 from ewif_jax.models.bank import bank
+from ewif_jax.models.inputs import driven
 from ewif_jax.models.model import Linear, Model, affine_motion
 from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor
@@ -28,10 +29,16 @@ Function = Callable[[Array], Array]
 
 @from_recipe
 def random_walk(
-    *, sensors: Sensor | Sequence[Sensor], q: Parameter = 0.0, dims: int = 1, b: Parameter = None
+    *,
+    sensors: Sensor | Sequence[Sensor],
+    q: Parameter = 0.0,
+    dims: int = 1,
+    b: Parameter = None,
+    u: Parameter = None,
 ) -> Model:
-    r"""Position driven by white noise: :math:`Q = q\,\Delta t`, q in m^2/s."""
-    return _kinematic_model(0, sensors, q, dims, "white", b)
+    r"""Position driven by white noise: :math:`Q = q\,\Delta t`, q in m^2/s. A known input u is a
+    velocity; see `constant_velocity`."""
+    return _kinematic_model(0, sensors, q, dims, "white", b, u)
 
 
 @from_recipe
@@ -42,6 +49,7 @@ def constant_velocity(
     dims: int = 1,
     noise: Literal["white", "discrete"] = "white",
     b: Parameter = None,
+    u: Parameter = None,
 ) -> Model:
     r"""Nearly constant velocity.
 
@@ -55,8 +63,10 @@ def constant_velocity(
         dims: number of space dimensions.
         noise: which of the two.
         b: known input, function (params, t0, t1) -> (n,) for t1 >= t0.
+        u: known acceleration, `inputs(times, values)` with values (K, dims) in m/s^2, or a function
+            of `params` that gives them; integrated exactly.
     """
-    return _kinematic_model(1, sensors, q, dims, noise, b)
+    return _kinematic_model(1, sensors, q, dims, noise, b, u)
 
 
 @from_recipe
@@ -67,10 +77,12 @@ def constant_acceleration(
     dims: int = 1,
     noise: Literal["white", "discrete"] = "white",
     b: Parameter = None,
+    u: Parameter = None,
 ) -> Model:
     """Nearly constant acceleration; arguments as in `constant_velocity`, one derivative higher
-    (q is the density of white jerk in m^2/s^5, or the variance of a constant jerk)."""
-    return _kinematic_model(2, sensors, q, dims, noise, b)
+    (q is the density of white jerk in m^2/s^5, or the variance of a constant jerk; u is a known
+    jerk)."""
+    return _kinematic_model(2, sensors, q, dims, noise, b, u)
 
 
 def _kinematic_model(
@@ -80,6 +92,7 @@ def _kinematic_model(
     dims: int,
     noise: str,
     b: Callable[..., Array] | None,
+    u: Parameter,
 ) -> Model:
     checks.whole("dims", dims, 1)
     checks.require(noise in ("white", "discrete"), "noise", "'white' or 'discrete'", repr(noise))
@@ -102,6 +115,9 @@ def _kinematic_model(
             domain.check_variance("q", resolve(q, params))
         check_seen(params, t0, t1, sensors)
 
+    if u is not None:
+        response = _response_matrix(order, dims)
+        b = driven(F, lambda params, t0, t1: response(_interval_of(t0, t1)), u, b)
     linear = None
     if group.matrix is not None:
         H, H_where = group.matrix(n)
@@ -133,6 +149,13 @@ def _motion_matrices(order: int, dims: int, noise: str) -> tuple[Function, Funct
     motion = _monomial_matrix(coefficient, power, dims)
     noise_terms = _white_terms(order) if noise == "white" else _held_terms(order)
     return motion, _monomial_matrix(*noise_terms, dims), pattern(np.kron(coefficient, np.eye(dims)))
+
+
+@cache
+def _response_matrix(order: int, dims: int) -> Function:
+    """dt () -> what the next derivative, held at 1 over dt, does to the state (n, dims)."""
+    power = order + 1 - np.arange(order + 1)[:, None]
+    return _monomial_matrix(1 / _factorial_of(power), power, dims)
 
 
 def _monomial_matrix(coefficient: np.ndarray, power: np.ndarray, dims: int) -> Function:

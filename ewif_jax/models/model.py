@@ -1,6 +1,7 @@
 """The model of the world that every filter shares, linear or not."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,9 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Pattern
 from ewif_jax.models import domain
 from ewif_jax.models.discrete import constant, is_discrete, motion, pattern_of_powers
+from ewif_jax.models.inputs import driven, need_both
 from ewif_jax.models.parameters import named, resolve
+from ewif_jax.models.steps import check_steps
 from ewif_jax.models.tables import (
     by_sensor,
     count_sensors,
@@ -25,7 +28,7 @@ from ewif_jax.models.tables import (
     wider_cov,
 )
 from ewif_jax.recipe import FromRecipe, from_recipe
-from ewif_jax.types import DTypeLike, Parameter, Params, Steps
+from ewif_jax.types import DTypeLike, Numbers, Parameter, Params, Steps
 
 __all__ = ["Linear", "Model", "affine", "affine_motion", "linear_model", "resolve", "subtract"]
 
@@ -99,6 +102,8 @@ def linear_model(
     Q: Parameter = None,
     b: Parameter = None,
     *,
+    B: Parameter = None,
+    u: Parameter = None,
     dt: float = 1.0,
     max_steps: int = 1023,
 ) -> Model:
@@ -128,6 +133,11 @@ def linear_model(
             a function of `params` alone; or None (no process noise).
         b: known input, function (params, t0, t1) -> (n,) for t1 >= t0; for one step (n,) or a
             function of `params` alone; or None.
+        B: what a constant unit input does to the state, function (params, t0, t1) -> (n, k) for
+            t1 >= t0; for one step (n, k) or a function of `params` alone; or None.
+        u: the input, `inputs(times, values)` or a function of `params` that gives them; integrated
+            exactly, cut at its own times. A discrete model takes inputs that change at whole steps:
+            a change between two steps is refused where it is known, else what it drives is NaN.
         dt: seconds of one step, a number > 0.
         max_steps: how many steps may be asked for at once.
 
@@ -154,6 +164,8 @@ def linear_model(
         checks.psd("Q", Q)
     Q = constant("Q", Q, (n, n)) if is_discrete(Q) else Q and named(one_program(Q))
     b = constant("b", b, (n,)) if is_discrete(b) else named(b)
+    need_both(B, u)
+    B = constant("B", B, (n, "k")) if is_discrete(B) else named(B)
     H, sizes_of_H = of_sizes("H", H, wider)
     R, sizes_of_R = of_sizes("R", R, wider_cov)
     sizes = same_sizes(sizes_of_H, sizes_of_R)
@@ -161,7 +173,8 @@ def linear_model(
     H, rows = by_sensor("H", H)
     R, cols = by_sensor("R", R)
     sensors = count_sensors(rows, cols)
-    moved = motion(F, Q, b, steps)
+    moved = motion(F, Q, b, B, steps)
+    offset = moved.b if moved.B is None else driven(moved.F, moved.B, u, moved.b)
 
     def process_cov(params: Params, t0: Array, t1: Array) -> Array:
         if moved.Q is None:
@@ -178,13 +191,15 @@ def linear_model(
         return domain.covariance("R", found) if R_varies else found
 
     linear = Linear(
-        moved.F, moved.b, H, pattern_of_powers(F), pattern_of_table(H_given), moved.reversible
+        moved.F, offset, H, pattern_of_powers(F), pattern_of_table(H_given), moved.reversible
     )
     check = domain.check_covariances(
         process_cov if callable(Q) else None, measurement_cov if R_varies else None
     )
+    if u is not None and is_discrete(B):
+        check = partial(_check_input, u, steps, check)
     return Model(
-        affine_motion(moved.F, moved.b),
+        affine_motion(moved.F, offset),
         process_cov,
         observe,
         measurement_cov,
@@ -194,6 +209,21 @@ def linear_model(
         check=check,
         sizes=sizes,
     )
+
+
+def _check_input(
+    u: Parameter,
+    steps: Steps,
+    check: Callable[..., None],
+    params: Params,
+    t0: Numbers,
+    t1: Numbers,
+    sensors: Numbers,
+) -> None:
+    """`check`, after refusing known inputs of a discrete model that change between two steps."""
+    times = resolve(u, params).times
+    check_steps(steps, times, t0, jnp.result_type(float), "u.times", in_order=False)
+    check(params, t0, t1, sensors)
 
 
 def affine_motion(F: Parameter, b: Parameter) -> Callable[..., Array]:
