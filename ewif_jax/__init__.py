@@ -42,6 +42,7 @@ from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
 from ewif_jax.estimators.gated import gated
 from ewif_jax.estimators.information import information
+from ewif_jax.estimators.iterated_extended import iterated_extended
 from ewif_jax.estimators.kalman import kalman
 from ewif_jax.estimators.limited_memory import limited_memory
 from ewif_jax.estimators.robust import robust
@@ -153,6 +154,7 @@ __all__ = [
     "gated",
     "information",
     "inputs",
+    "iterated_extended",
     "kalman",
     "kalman_bucy",
     "likelihood_loss",

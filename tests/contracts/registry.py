@@ -123,6 +123,7 @@ ROWS = (
         predicts_back=True,
     ),
     Row("extended", ej.extended),
+    Row("iterated_extended", ej.iterated_extended),
     Row("unscented", unscented),
     Row("ensemble", lambda model: ensemble(model, 20), needs_key=True),
     Row(
