@@ -60,9 +60,7 @@ def iterated_extended(model: Model, iterations: int = 5) -> Estimator:
         prior, cov = state.mean, state.cov
         first, kept, info = updated(model, prior, cov, compared(model, params, prior, measurement))
 
-        def step(
-            before: tuple[Array, Array, Array], _: None
-        ) -> tuple[tuple[Array, Array, Array], None]:
+        def step(_: Array, before: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             mean, _, good = before
             seen = compared(model, params, mean, measurement)
             seen = seen._replace(difference=seen.difference - matvec(seen.H, prior - mean))
@@ -70,10 +68,10 @@ def iterated_extended(model: Model, iterations: int = 5) -> Estimator:
             mean, packed, again = updated(model, prior, cov, seen)
             fine = good & (again.status == Status.USED) & jnp.all(jnp.isfinite(mean))
             # What runs away goes on from the prediction, so that nothing is computed from it.
-            return (jnp.where(fine, mean, prior), jnp.where(fine, packed, cov), fine), None
+            return jnp.where(fine, mean, prior), jnp.where(fine, packed, cov), fine
 
         begin = first, kept, info.status == Status.USED
-        (mean, cov, good), _ = lax.scan(step, begin, length=more)
+        mean, cov, good = lax.fori_loop(0, more, step, begin)
         status = jnp.where(good, info.status, jnp.int32(Status.REJECTED))
         return CovarianceState(state.time, mean, cov), info._replace(status=status)
 

@@ -1,8 +1,11 @@
 """The unscented transform as a linearisation: a slope, and what a straight line leaves over."""
 
+from functools import cache
+from itertools import product
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ewif_jax.fast.small import matmul, matvec
@@ -48,6 +51,35 @@ def regression(differences: Array, scale: Array, centre: Array) -> Regression:
     bend = ahead + behind
     left_over = matmul(bend, bend.T) + centre * (shift[:, None] * shift[None, :])
     return Regression(shift, ahead - behind, left_over)
+
+
+@cache
+def gauss_hermite(n: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, order^n) and positive weights of sum one, which give the mean of every polynomial
+    of degree up to 2 order - 1 in each of n independent standard normal numbers."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(order)
+    weights = weights / weights.sum()
+    points = np.array(list(product(nodes, repeat=n))).T
+    return points, np.array([np.prod(w) for w in product(weights, repeat=n)])
+
+
+def quadrature(differences: Array, points: Array, weights: Array) -> Regression:
+    r"""The straight line through a function of a Gaussian, by points (n, N) of a quadrature.
+
+    `differences` (m, N) are the function's values at the points minus its value at the mean. With
+    weights :math:`w_i` and :math:`d_i` the differences,
+
+    .. math::
+        s = \sum_i w_i d_i, \quad D = \sum_i w_i (d_i - s) \xi_i', \quad
+        \Omega = \sum_i w_i e_i e_i', \quad e_i = d_i - s - D \xi_i
+
+    so that :math:`P_{yy} = D D' + \Omega` is a sum of squares, as in `regression`.
+    """
+    shift = matmul(differences, weights[:, None])[:, 0]
+    around = differences - shift[:, None]
+    slope = matmul(around * weights[None], points.T)
+    bend = around - matmul(slope, points)
+    return Regression(shift, slope, matmul(bend * weights[None], bend.T))
 
 
 def slope_of(line: Regression, root: cholesky.Factor) -> Array:

@@ -21,6 +21,8 @@ from ewif_jax.types import DTypeLike, Info, Measurement, Params
 
 ROUNDING = 1e-4
 """The largest share of a value that the weights may turn rounding into."""
+MOST = 20_000
+"""Points of a quadrature: nine states by three of each."""
 
 
 class SigmaPoints(NamedTuple):
@@ -31,11 +33,42 @@ class SigmaPoints(NamedTuple):
     ut_kappa: Any = 0.0
 
 
+class GaussHermite(NamedTuple):
+    """`order` points along each axis, in every combination."""
+
+    order: int
+
+    def grid(self, n: int, dtype: DTypeLike) -> tuple[Array, Array]:
+        """Points (n, order^n) and weights for n states; refuses more points than anyone wants."""
+        count = self.order**n
+        checks.require(
+            count <= MOST,
+            "order",
+            f"at most {MOST} points, the order to the power of {n} states (take a smaller order, "
+            "or points='unscented': two for each state)",
+            f"{self.order}, {count} points",
+        )
+        points, weights = sigma_points.gauss_hermite(n, self.order)
+        return jnp.asarray(points, dtype), jnp.asarray(weights, dtype)
+
+
+Points = SigmaPoints | GaussHermite
+"""Where a function of a Gaussian is looked at."""
+
+
 class PointWeights(NamedTuple):
     """c = n + lambda, and the covariance weight of the central point."""
 
     scale: Array
     centre: Array
+
+
+def check_points(points: Points, params: Params, n: int, dtype: DTypeLike) -> None:
+    """Refuses settings that n states or `dtype` cannot carry."""
+    if isinstance(points, GaussHermite):
+        points.grid(n, dtype)
+    else:
+        transform(points, params, n, dtype)
 
 
 def transform(points: SigmaPoints, params: Params, n: int, dtype: DTypeLike) -> PointWeights:
@@ -72,7 +105,7 @@ def view(
 
 def flow_around(
     model: Model,
-    points: SigmaPoints | None,
+    points: Points | None,
     params: Params,
     mean: Array,
     cov: Array,
@@ -92,7 +125,7 @@ def flow_around(
 
 
 def move_around(
-    model: Model, points: SigmaPoints, params: Params, mean: Array, cov: Array, t0: Array, t1: Array
+    model: Model, points: Points, params: Params, mean: Array, cov: Array, t0: Array, t1: Array
 ) -> tuple[Array, Array]:
     """Mean (n,) and packed covariance at t1 of a Gaussian at t0 with a packed `cov`."""
     if model.linear is not None:
@@ -106,7 +139,7 @@ def move_around(
 
 def measure_around(
     model: Model,
-    points: SigmaPoints | None,
+    points: Points | None,
     params: Params,
     mean: Array,
     cov: Array,
@@ -161,7 +194,7 @@ def _fine_root(cov: Array, n: int, exact: Array | bool = False) -> Array:
 
 def _moved_line(
     model: Model,
-    points: SigmaPoints,
+    points: Points,
     params: Params,
     mean: Array,
     lower: Array,
@@ -180,7 +213,7 @@ def _moved_line(
 def _regressed_line(
     f: Callable[[Array], Array],
     apart: Callable[[Array, Array], Array],
-    points: SigmaPoints,
+    points: Points,
     params: Params,
     mean: Array,
     lower: Array,
@@ -193,19 +226,29 @@ def _regressed_line(
 
     The points that are moved along a column of the other components have f of the mean: they spread
     the rest, and each adds to what is left over as the central point does."""
-    scale, centre = transform(points, params, mean.shape[0], mean.dtype)
-    # Each of the 2 `still` points that do not move f has the weight 1 / (2 scale).
-    centre = centre + still / scale
-    mean = mean[: mean.shape[0] - still]
-    around = mean[:, None] + sigma_points.offsets(lower, scale)
-    middle = f(mean)
+    moving = mean[: mean.shape[0] - still]
+    middle = f(moving)
 
     def difference(x: Array) -> Array:
         return apart(f(x), middle)
 
-    differences = jax.vmap(difference, in_axes=1, out_axes=1)(around)
-    good = jnp.all(jnp.isfinite(differences))
-    differences = jnp.where(good, differences, 0)
-    line = sigma_points.regression(differences, scale, centre)
+    def differences(offsets: Array) -> Array:
+        return jax.vmap(difference, in_axes=1, out_axes=1)(moving[:, None] + offsets)
+
+    if isinstance(points, GaussHermite):
+        grid, weights = points.grid(moving.shape[0], mean.dtype)
+        apart_by, good = _numbers_only(differences(matmul(lower, grid)))
+        line = sigma_points.quadrature(apart_by, grid, weights)
+    else:
+        scale, centre = transform(points, params, mean.shape[0], mean.dtype)
+        apart_by, good = _numbers_only(differences(sigma_points.offsets(lower, scale)))
+        # Each of the 2 `still` points that do not move f has the weight 1 / (2 scale).
+        line = sigma_points.regression(apart_by, scale, centre + still / scale)
     found = middle + line.shift, line
     return choose(good, found, jax.tree.map(lambda _: jnp.nan, found))
+
+
+def _numbers_only(values: Array) -> tuple[Array, Array]:
+    """`values`, all zero unless all are finite, and whether they are."""
+    good = jnp.all(jnp.isfinite(values))
+    return jnp.where(good, values, 0), good

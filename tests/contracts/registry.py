@@ -125,6 +125,12 @@ ROWS = (
     Row("extended", ej.extended),
     Row("iterated_extended", ej.iterated_extended),
     Row("unscented", unscented),
+    Row(
+        "gauss_hermite",
+        lambda model: unscented(model, points="gauss-hermite"),
+        refuses="unscented",
+        variant=True,
+    ),
     Row("ensemble", lambda model: ensemble(model, 20), needs_key=True),
     Row(
         "ensemble_square_root",
