@@ -46,7 +46,7 @@ def turn_methods(particles: int = 10_000) -> dict[str, TurnMethod]:
     take their place."""
     model = turn_model()
     in_sequence = bootstrap(model, particles)
-    points = PRINTED if _as_printed() else {}
+    points: dict[str, Any] = PRINTED if _as_printed() else {}
 
     def smoothing(smoother: Any, **setting: Any) -> TurnMethod:
         return TurnMethod(pf_fixed_point(model, particles, LAG, smoother, **setting))
