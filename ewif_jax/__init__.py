@@ -41,6 +41,7 @@ from ewif_jax.estimators.ewif_bank import bank_weights, ewif_bank
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
 from ewif_jax.estimators.gated import gated
+from ewif_jax.estimators.guided import guided
 from ewif_jax.estimators.information import information
 from ewif_jax.estimators.iterated_extended import iterated_extended
 from ewif_jax.estimators.kalman import kalman
@@ -152,6 +153,7 @@ __all__ = [
     "forecast",
     "gain_history",
     "gated",
+    "guided",
     "information",
     "inputs",
     "iterated_extended",

@@ -209,6 +209,7 @@ ROWS = (
     ),
     Row("fixed_lag", lambda model: fixed_lag(model, 2)),
     Row("bootstrap", lambda model: bootstrap(model, 64), needs_key=True, differentiable=False),
+    Row("guided", lambda model: ej.guided(model, 64), needs_key=True, differentiable=False),
     Row(
         "pf_retrodict",
         lambda model: pf_retrodict(model, 64),
