@@ -1,11 +1,15 @@
 """Growing variances, within what their dtype can square and divide by."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from ewif_jax.types import DTypeLike
 
+Fade = Callable[[Array], Array]
+"""From variances (n,) to what they are after a while."""
 SHORT = 0.5
 """In units of tau: what an interval adds to a variance is less than the variance."""
 

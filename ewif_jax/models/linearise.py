@@ -105,13 +105,14 @@ def need_model(model: Model, method: str) -> None:
     checks.require(ok, "model", expected, f"a {type(model).__name__}")
 
 
-def need_linear(model: Model, method: str) -> Linear:
-    """The matrices of `model`, or an error that says which method wanted them."""
+def need_linear(model: Model, method: str, instead: str = "use `extended`") -> Linear:
+    """The matrices of `model`, or an error that says which method wanted them, and what to do
+    `instead`."""
     need_model(model, method)
     checks.require(
         model.linear is not None,
         "model",
-        f"a linear model: {method} needs F and H (use `extended` for a nonlinear one)",
+        f"a linear model: {method} needs F and H ({instead} for a nonlinear one)",
         "a Model without matrices",
     )
     assert model.linear is not None

@@ -8,7 +8,6 @@ ever unknown again. The targets keep what re-centring leaves over, rounding of t
 far from the origin that is more than what one measurement changes.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,12 +18,12 @@ from ewif_jax.fast.batched import largest
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import absorbing, cholesky, equations, gaussian, remainders, symmetric
-from ewif_jax.kernels.growth import bounded_reciprocal, grown
+from ewif_jax.kernels.growth import Fade, bounded_reciprocal, grown
 from ewif_jax.kernels.orthogonal import spread
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
 from ewif_jax.models.linearise import affine_flow, size
-from ewif_jax.recursions.sighting import noise_of, sight, still_at_once, summed
+from ewif_jax.recursions.sighting import Sight, noise_of, sight, still_at_once, summed
 from ewif_jax.types import Gaussian, Info, Measurement, Numbers, Params, Status
 
 
@@ -66,7 +65,7 @@ def transport(
     params: Params,
     state: InformationState,
     time: Array,
-    fade: Callable[[Array], Array] | None = None,
+    fade: Fade | None = None,
     noise: Array | None = None,
 ) -> InformationState:
     """The state at `time`, in either direction: variances as `fade` makes them (None: as they are),
@@ -209,8 +208,19 @@ def absorb(
 ) -> tuple[InformationState, Info]:
     """The state with a measurement of any time, its R times `growth`, and its `Info`: one seen
     through a motion that has no way back, or (unless `exact`) without noise, is REJECTED."""
-    seen, difference, R, size = sight(model, params, state.mean, state.time, measurement)
-    mask = measurement.mask
+    found = sight(model, params, state.mean, state.time, measurement)
+    return absorb_sight(state, found, measurement, growth, exact)
+
+
+def absorb_sight(
+    state: InformationState,
+    found: Sight,
+    measurement: Measurement,
+    growth: Array | float,
+    exact: bool = False,
+) -> tuple[InformationState, Info]:
+    """`absorb` of a measurement of which it is known how it is seen."""
+    (seen, difference, R, size), mask = found, measurement.mask
     # No value decides here: runs that differ only in their values share what is not the targets.
     noise, good = noise_of(gaussian.mask_cov(R, mask), seen, exact)
     good &= ~jnp.any(jnp.isnan(state.variances))

@@ -23,12 +23,19 @@ def still_at_once(F: Array | Matrix, at_once: Array) -> Array | Matrix:
     return jnp.where(at_once, jnp.eye(F.shape[0], dtype=F.dtype), F)
 
 
-def sight(
-    model: Model, params: Params, mean: Array, now: Array, measurement: Measurement
-) -> tuple[Array, Array, Array, Array | None]:
-    """H A (m, n), measured minus what `mean` (n,) at time `now` predicts (m,), R (m, m), and how
-    large the terms of H A are, (m, n), None where it is known which are zero; zeros where masked.
-    """
+class Sight(NamedTuple):
+    """A measurement of any time as one of the present state: H A (m, n), measured minus predicted
+    (m,), R (m, m), and how large the terms of H A are, (m, n), None where it is known which are
+    zero; zeros where masked."""
+
+    seen: Array
+    difference: Array
+    R: Array
+    size: Array | None
+
+
+def sight(model: Model, params: Params, mean: Array, now: Array, measurement: Measurement) -> Sight:
+    """The measurement as `mean` (n,) at time `now` sees it."""
     dtype = mean.dtype
     mask = measurement.mask
     A, c = affine_flow(model, params, now, measurement.time, dtype)
@@ -48,7 +55,7 @@ def sight(
     if not isinstance(A, Matrix):
         sizes = matmul(elementwise(jnp.abs, H), jnp.abs(A))
         size = jnp.where(mask[:, None], sizes, 0)
-    return seen, jnp.where(mask, difference, 0), R, size
+    return Sight(seen, jnp.where(mask, difference, 0), R, size)
 
 
 def summed(unit: cholesky.Factor, sizes: Array) -> Array:

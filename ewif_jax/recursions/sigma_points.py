@@ -158,7 +158,7 @@ def measure_around(
     root = _divisible_root(cov, n) if still else None
     exact = ~cholesky.factor(gaussian.mask_cov(jnp.asarray(R, mean.dtype), mask)).full_rank
     lower = _fine_root(cov, n, exact) if root is None else root.lower
-    predicted, line = _regressed_line(see, apart, points, params, mean, lower, still)
+    predicted, line = regressed_line(see, apart, points, params, mean, lower, still)
     checks.shape("measurement.value", measurement.value, predicted.shape)
     checks.shape("R", R, predicted.shape * 2)
     # After an exact measurement the points differ by rounding only, as the members of ensembles do.
@@ -207,22 +207,22 @@ def _moved_line(
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    return _regressed_line(move, jnp.subtract, points, params, mean, lower, still)
+    return regressed_line(move, jnp.subtract, points, params, mean, lower, still)
 
 
-def _regressed_line(
+def regressed_line(
     f: Callable[[Array], Array],
     apart: Callable[[Array, Array], Array],
     points: Points,
     params: Params,
     mean: Array,
     lower: Array,
-    still: int,
+    still: int = 0,
 ) -> tuple[Array, sigma_points.Regression]:
     """Mean and straight line of f of all but the last `still` components of a Gaussian, whose
-    covariance has the factor `lower`. Values are compared through `apart` with the one at the mean,
-    so that angles on both sides of a cut have a mean. NaN, without harm to gradients, where a value
-    is not a number.
+    covariance is `lower` times its transpose. Values are compared through `apart` with the one at
+    the mean, so that angles on both sides of a cut have a mean. NaN, without harm to gradients,
+    where a value is not a number.
 
     The points that are moved along a column of the other components have f of the mean: they spread
     the rest, and each adds to what is left over as the central point does."""

@@ -107,6 +107,20 @@ ROWS = (
         accepts_no_prior=True,
         predicts_back=True,
     ),
+    *(
+        Row(
+            f"ewif_{kind}",
+            lambda model, kind=kind: ej.ewif(
+                model._replace(linear=None), of("tau"), linearisation=kind
+            ),
+            late=Status.LATE_USED,
+            any_age=True,
+            predicts_back=True,
+            refuses="ewif",
+            variant=kind == "sigma-points",
+        )
+        for kind in ("extended", "sigma-points")
+    ),
     Row(
         "ewif_bank",
         lambda model: ej.ewif_bank(model, lambda p: p["tau"] * jnp.asarray([0.5, 1.0, 3.0])),
