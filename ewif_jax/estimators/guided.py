@@ -9,7 +9,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import dense
-from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.kernels import cholesky
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.models import Model, predict_measurement
 from ewif_jax.recipe import from_recipe
@@ -117,11 +117,14 @@ def guided(
         params: Params, state: GuidedState, measurement: Measurement
     ) -> tuple[GuidedState, Info]:
         key, ours = jax.random.split(state.key)
-        seen = weighing.look_of_cloud(
-            model, params, state.particles, state.log_weights, measurement
-        )
-        drawn = _proposed(model, params, state, measurement, ours)
-        found = weighing.compared_cloud(model, params, drawn.particles, measurement)
+        # One R for all, and for both looks, where it depends on the state.
+        cloud = state.particles, state.log_weights
+        noise = weighing.compared_cloud(model, params, *cloud, measurement)
+        seen = weighing.look_of_cloud(model, params, *cloud, measurement)
+        drawn = _proposed(model, params, state, measurement, noise.factor, ours)
+        found = weighing.compared_cloud(
+            model, params, drawn.particles, state.log_weights, measurement
+        )._replace(R=noise.R, factor=noise.factor)
         if model.linear is not None:
             density = _common_density(found, measurement.mask) + drawn.evidence
         else:
@@ -138,7 +141,12 @@ def guided(
 
 
 def _proposed(
-    model: Model, params: Params, state: GuidedState, measurement: Measurement, key: Array
+    model: Model,
+    params: Params,
+    state: GuidedState,
+    measurement: Measurement,
+    noise: cholesky.Factor,
+    key: Array,
 ) -> Proposal:
     """The particles drawn with the measurement in view.
 
@@ -148,8 +156,6 @@ def _proposed(
     """
     time, value, sensor, mask = measurement
     n = state.root.shape[0]
-    R = jnp.asarray(model.measurement_cov(params, sensor, time), state.origins.dtype)
-    noise = cholesky.factor(gaussian.mask_cov(R, mask))
     normals = jax.random.normal(key, state.origins.shape, state.origins.dtype)
 
     def draw(origin: Array, normal: Array) -> Proposal:
