@@ -10,7 +10,8 @@ from ewif_jax.clocks import slack
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.components import existing
 from ewif_jax.models.steps import whole_steps
-from ewif_jax.streams import cast, in_dtype
+from ewif_jax.plain import in_dtype
+from ewif_jax.streams import cast
 from ewif_jax.types import (
     DTypeLike,
     Estimator,

@@ -21,6 +21,12 @@ def native(x: Numbers) -> Any:
     return x
 
 
+def in_dtype(x: Numbers, dtype: DTypeLike) -> Any:
+    """`x` in `dtype`, its value known as before."""
+    value = checks.concrete_value(x)
+    return jnp.asarray(x, dtype) if value is None else value.astype(dtype)
+
+
 def numbers(argument: str, x: Numbers, missing: bool = False) -> Any:
     """`x` as an array of real numbers: an array of JAX as it is, all else as NumPy's, whole numbers
     as float64 (JAX would cut them to 32 bits).

@@ -214,12 +214,6 @@ def cast(measurement: Measurement, dtype: DTypeLike) -> Measurement:
     return Measurement(
         jnp.asarray(measurement.time, dtype),
         jnp.where(mask, jnp.asarray(measurement.value, dtype), 0),
-        in_dtype(measurement.sensor, np.int32),
+        plain.in_dtype(measurement.sensor, np.int32),
         mask,
     )
-
-
-def in_dtype(x: Numbers, dtype: DTypeLike) -> Any:
-    """`x` in `dtype`, its value known as before."""
-    value = checks.concrete_value(x)
-    return jnp.asarray(x, dtype) if value is None else value.astype(dtype)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from ewif_jax import checks
 from ewif_jax.fast.batched import kernel, total
 from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import (
@@ -96,6 +97,7 @@ def update(
     measurement leaves: its rounding would be weighed like knowledge by the next such measurement.
     """
     H = elementwise(lambda H: jnp.where(mask[:, None], H, 0), H)
+    is_exact_nowhere = _is_noise(R)
     R = mask_cov(R, mask)
     cross = symmetric.rows(H, packed)
     values, where = apart(H)
@@ -108,8 +110,17 @@ def update(
     # steps on the triangle in place of two n x n products.
     half = _packed_less(packed, cross, weights)
     left_over = _left_over(R, weights, symmetric.rows(H, half))
+    if is_exact_nowhere:
+        return mean, _packed_sum(half, weights, left_over), innovation
     least = _least_share(mean.shape[0])(R, cov)
     return mean, _packed_more(packed, half, weights, left_over, least), innovation
+
+
+def _is_noise(R: Array) -> bool:
+    """Whether every component is known, while tracing, to be measured with noise. Nothing has to be
+    compared with the rounding of an exact measurement then, which is a tenth of a batch's time."""
+    known = checks.concrete_value(R)
+    return known is not None and bool((np.diagonal(known) > 0).all())
 
 
 def rounding_of(predicted: Array) -> Array:
@@ -190,6 +201,13 @@ def _packed_less(packed: Array, cross: Array, weights: Array) -> Array:
 def _left_over(R: Array, weights: Array, seen: Array) -> Array:
     """R K' - H half; `seen` = H half."""
     return _contract_first(R[:, :, None], weights[:, None, :]) - seen
+
+
+@kernel
+def _packed_sum(half: Array, weights: Array, left_over: Array) -> Array:
+    """half + K left_over, packed, no variance below 0."""
+    rows, cols = np.triu_indices(weights.shape[1])
+    return symmetric.no_negative(half + _contract_first(weights[:, rows], left_over[:, cols]))
 
 
 @kernel

@@ -10,6 +10,7 @@ from ewif_jax.fast.small import matvec
 from ewif_jax.fast.sparse import Matrix, with_zeros
 from ewif_jax.models.model import Linear, Model, affine
 from ewif_jax.models.sensor_range import check_sensor
+from ewif_jax.plain import in_dtype
 from ewif_jax.types import DTypeLike, Numbers, Params
 
 
@@ -68,7 +69,7 @@ def affine_flow(
 
 def noise_at(model: Model, params: Params, x: Array, sensor: Array, t: Array) -> Array:
     """R (m, m) of a measurement that is predicted from the state x (n,)."""
-    R = jnp.asarray(model.measurement_cov(params, sensor, t), x.dtype)
+    R = in_dtype(model.measurement_cov(params, sensor, t), x.dtype)
     return R if model.jitter is None else R + model.jitter(params, x, sensor, t)
 
 
@@ -89,7 +90,7 @@ def observation(
     linear = need_linear(model, "this operation")
     check_sensor(model, params, None, sensor, t)
     H = with_zeros(jnp.asarray(linear.H(params, sensor, t), dtype), linear.H_where)
-    return H, jnp.asarray(model.measurement_cov(params, sensor, t), dtype)
+    return H, in_dtype(model.measurement_cov(params, sensor, t), dtype)
 
 
 def size(model: Model, params: Params, t0: Numbers) -> int:
