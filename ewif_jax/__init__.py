@@ -50,6 +50,7 @@ from ewif_jax.estimators.robust import robust
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.fast.compiling import prepare_cpu
+from ewif_jax.latency import corrected
 from ewif_jax.live import arrivals, forecast, step, step_batch
 from ewif_jax.losses import (
     likelihood_loss,
@@ -133,6 +134,7 @@ __all__ = [
     "bl1",
     "bootstrap",
     "continuous",
+    "corrected",
     "crlb",
     "cross_validated",
     "cutoff_delay",

@@ -27,6 +27,7 @@ from ewif_jax.fast.layout import (
 )
 from ewif_jax.fast.loops import Loop, over_runs
 from ewif_jax.fast.slopes import with_few_slopes
+from ewif_jax.latency import on_time
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.types import (
     DTypeLike,
@@ -35,6 +36,7 @@ from ewif_jax.types import (
     Info,
     Measurement,
     Numbers,
+    Parameter,
     Params,
     PyTree,
     RandomKey,
@@ -66,6 +68,7 @@ def run_batch(
     times: Numbers = None,
     clock: Clock = "validity",
     key: RandomKey = None,
+    latency: Parameter = None,
     params_per_run: PyTree = False,
     observe: Observer | None = None,
     context: PyTree = None,
@@ -84,6 +87,7 @@ def run_batch(
         times: (T,) or (R, T) report times as in `run`.
         clock: as in `run`.
         key: PRNG key, split over the runs; or (R,) typed keys, one for each.
+        latency: as in `run`; of a function of parameters that differ by run, each run's own.
         params_per_run: True, False, or a pytree prefix of `params` of these.
         observe: function (Step of one arrival, its context) -> pytree to return instead of
             everything; what it does not use is not computed.
@@ -103,6 +107,8 @@ def run_batch(
     params, measurements, prior, t0, times = given(
         params, measurements, prior, t0, times, batched=True
     )
+    per_run = per_run_flags("params", params_per_run, params)
+    measurements = on_time(estimator.model, latency, params, measurements, per_run)
     input_flags, content, sifted = examined(
         estimator, params, params_per_run, measurements, prior, t0, times, clock, key
     )

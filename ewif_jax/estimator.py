@@ -12,6 +12,7 @@ from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit, transformed
 from ewif_jax.fast.slopes import with_few_slopes
 from ewif_jax.models.components import check_components
+from ewif_jax.latency import on_time
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
 from ewif_jax.types import (
@@ -19,6 +20,7 @@ from ewif_jax.types import (
     Gaussian,
     Measurement,
     Numbers,
+    Parameter,
     Params,
     RandomKey,
     State,
@@ -38,6 +40,7 @@ def run(
     times: Numbers = None,
     clock: Clock = "validity",
     key: RandomKey = None,
+    latency: Parameter = None,
 ) -> Trace:
     """Estimates after each arrival of a stream.
 
@@ -53,6 +56,8 @@ def run(
         clock: "validity": the filter's time is the newest measurement's. "arrival": the filter
             itself moves to times[k] before update k, so any older measurement is late.
         key: PRNG key, for estimators that draw noise.
+        latency: seconds by which the stamps of each sensor are late: a number, (S,), or a function
+            of `params`; taken out of the times first, see `corrected`.
 
     Returns:
         A `Trace`: time (T,), mean (T, n), cov (T, n, n), info, final_state. The dtype is that of
@@ -64,6 +69,7 @@ def run(
     checks.estimator(estimator)
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_components(estimator.model, measurements)
+    measurements = on_time(estimator.model, latency, params, measurements)
     state = validated(estimator, params, measurements, prior, t0, times, clock, key)
     prior = prior_in(prior, float_dtype(measurements.value))
     filtered = _compiled_run(measurements.time.shape[0], state, key)

@@ -18,6 +18,7 @@ from ewif_jax.fast.loops import Loop, over_runs
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.fast.slopes import with_few_slopes
 from ewif_jax.models.components import check_components
+from ewif_jax.latency import on_time
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.models.steps import check_steps
@@ -59,6 +60,7 @@ def step(
     """
     checks.estimator(estimator)
     check_components(estimator.model, measurement, "measurement")
+    measurement = on_time(estimator.model, None, params, measurement)
     _check_arrival(estimator, params, state, measurement)
     return _step(estimator, params, state, measurement)
 
@@ -104,6 +106,8 @@ def step_batch(
     same_runs("state", state, every, runs)
     marks = ranked(measurement, (0, 1, 0, 1))
     same_runs("measurement", measurement, marks, runs)
+    measurement = on_time(estimator.model, None, params, measurement, flags)
+    marks = ranked(measurement, (0, 1, 0, 1))
     _check_steps_of_tracks(estimator, state, measurement)
     check_components(estimator.model, measurement, "measurement")
     # Tracks with the lowest parameters are where a variance would be negative first; to check all R

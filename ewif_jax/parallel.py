@@ -14,6 +14,7 @@ from ewif_jax.arrival import arrive, initial
 from ewif_jax.estimators.ewif import ewif, growth
 from ewif_jax.models.components import check_components
 from ewif_jax.models.linearise import need_known_noise
+from ewif_jax.latency import on_time
 from ewif_jax.models.model import Model
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions import passage as way
@@ -73,6 +74,7 @@ def run_parallel(
     need_known_noise(model, "run_parallel")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
     check_components(model, measurements)
+    measurements = on_time(model, None, params, measurements)
     validated(estimator, params, measurements, prior, t0, times, "validity", None)
     measurements = cast(measurements, float_dtype(measurements.value))
     steps = measurements.value.shape[0]

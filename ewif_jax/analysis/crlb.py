@@ -10,6 +10,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.kernels import cholesky, gaussian
+from ewif_jax.latency import on_time
 from ewif_jax.models import Model
 from ewif_jax.models.components import check_components, existing
 from ewif_jax.models.linearise import noise_at
@@ -60,6 +61,7 @@ def crlb(
     """
     checked_stream(measurements)
     check_components(model, measurements)
+    measurements = on_time(model, None, params, measurements)
     checks.finite("time", time)
     dtype = float_dtype(state)
     check_finite_information(model, params, measurements)

@@ -13,6 +13,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.trees import choose
+from ewif_jax.latency import on_time
 from ewif_jax.models import Model, predict_measurement, predict_state
 from ewif_jax.models.components import check_components, existing
 from ewif_jax.streams import cast, checked_stream, float_dtype
@@ -73,7 +74,7 @@ def pcrlb(
     many = jnp.ndim(truth) == 3
     truth, start = (x if many else jnp.asarray(x)[None] for x in (truth, start))
     stream, truth, first = _checked_inputs(model, params, measurements, truth, start, prior_cov, t0)
-    time = checks.concrete_value(measurements.time)
+    time = checks.concrete_value(stream.time)
     in_order = time is None or np.all(np.diff(time) >= 0)
     checks.require(in_order, "measurements.time", "times that do not decrease", time)
     return _in_order(model, params, stream, truth, first)
@@ -304,6 +305,7 @@ def _checked_inputs(
     """The measurements, the truth (R, T, n) and the bound at t0, all in the float dtype of the
     truth, after what can be known is checked."""
     checked_stream(measurements)
+    measurements = on_time(model, None, params, measurements)
     checks.sensors(measurements, model.sensors)
     check_components(model, measurements)
     check_finite_information(model, params, measurements)

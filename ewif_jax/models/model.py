@@ -70,6 +70,7 @@ class _ModelFields(NamedTuple):
     returns_well: bool = False
     sizes: tuple[int, ...] | None = None
     jitter: Callable[..., Array] | None = None
+    latency: Callable[..., Numbers] | None = None
 
 
 class Model(FromRecipe, _ModelFields):
@@ -91,6 +92,7 @@ class Model(FromRecipe, _ModelFields):
         and what a sensor lacks is absent (see `models.components`)
     jitter: jitter(params, x, sensor, t) -> (m, m), noise beside measurement_cov that depends on the
         predicted state (see `models.jittered`)
+    latency: latency(params) -> (S,) seconds by which the stamps of each sensor are late, or None
     """
 
 

@@ -13,6 +13,7 @@ from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
 from ewif_jax.models.components import existing
+from ewif_jax.latency import on_time
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -84,6 +85,7 @@ def batch_wls(
     need_reversible(model, "batch_wls")
     need_known_noise(model, "batch_wls")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    measurements = on_time(model, None, params, measurements)
     checks.require(times is not None, "times", "when to estimate, (K,) seconds", None)
     check_sensors(model, params, None, measurements)
     refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "batch_wls")

@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models.components import existing
+from ewif_jax.latency import on_time
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.linearise import need_model
 from ewif_jax.models.model import Model
@@ -87,6 +88,7 @@ def rts(
     """
     need_model(model, "rts")
     params, measurements, start, t0, _ = given(params, measurements, prior, t0, None)
+    measurements = on_time(model, None, params, measurements)
     prior = checks.needs_prior(start, "rts")
     checks.prior(prior)
     checks.require(t0 is not None, "t0", "the time of the prior in seconds", None)

@@ -10,6 +10,7 @@ from ewif_jax import checks
 from ewif_jax.kernels.growth import decayed, exponential
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models.components import existing
+from ewif_jax.latency import on_time
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
@@ -73,6 +74,7 @@ def two_sided_ewif(
     need_reversible(model, "two_sided_ewif")
     need_known_noise(model, "two_sided_ewif")
     params, measurements, prior, t0, times = given(params, measurements, prior, t0, times)
+    measurements = on_time(model, None, params, measurements)
     check_sensors(model, params, None, measurements)
     decay = checks.positive_number("tau", resolve(tau, params))
     refuse_exact(model, params, checks.with_dtype(measurements.time).min(), "two_sided_ewif")
