@@ -115,6 +115,18 @@ def test_a_sensor_of_ones_own_is_filtered():
 
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
+
+
+def test_the_examples_of_tuning_find_what_they_say():
+    page = (ROOT / "docs" / "tuning.md").read_text()
+    space: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "tuning.md", "exec"), space)
+    latency, errors = space["tuned"].params["latency"], space["errors"]
+    assert errors["latency"] < 0.05
+    assert abs(latency - 0.4) < 3 * errors["latency"]
+
+
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("ewif_jax/**/*.md")])
 
 
