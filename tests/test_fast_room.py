@@ -13,6 +13,7 @@ import pytest
 import ewif_jax as ej
 from ewif_jax import checks
 from ewif_jax.fast import compiling, memo
+from ewif_jax.fast.blocks import Portion, scan_in_blocks
 from ewif_jax.fast.memo import Memo, once, question_of, remembered
 
 ROOM = Path(memo.__file__).parent
@@ -192,3 +193,36 @@ def test_options_that_xla_does_not_know_are_left_out_one_by_one(monkeypatch):
         assert quick(jnp.float32(1.0)) == 2.0
     finally:
         compiling._known_options.cache_clear()
+
+
+def in_blocks(rate, shift, together):
+    """A loop whose arrivals are differentiated too, a block of four steps at a time."""
+    arrivals = jnp.arange(8.0) - shift * (jnp.arange(8.0) % 3)
+
+    def step(state, arrival):
+        state = jnp.sin(rate * (state + arrival**3))
+        return state, state
+
+    portion = Portion(1, 4, together)
+    seen, _ = scan_in_blocks(step, jnp.zeros(()), arrivals, lambda y: y[None], portion, None)
+    return seen.sum()
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_slopes_of_every_order_go_to_what_is_read_from_the_whole(together):
+    """Forward over reverse lost those of what arrives, which tuned latencies move."""
+
+    def loss(x):
+        return in_blocks(*x, together)
+
+    at = jnp.array([0.7, 0.3])
+    wanted = jax.jacfwd(jax.jacfwd(lambda x: in_blocks(*x, False)))(at)
+    assert np.abs(wanted).min() > 1
+    for outer, inner in ((jax.jacfwd, jax.grad), (jax.jacrev, jax.grad), (jax.jacrev, jax.jacfwd)):
+        np.testing.assert_allclose(outer(inner(loss))(at), wanted, rtol=1e-9)
+    for k, other in ((0, 1), (1, 0)):  # of one alone, then of the other
+
+        def slope(*x, k=k):
+            return jax.grad(in_blocks, k)(*x, together)
+
+        np.testing.assert_allclose(jax.grad(slope, other)(*at), wanted[0, 1], rtol=1e-9)

@@ -91,8 +91,7 @@ def scan_in_blocks(
 def like(part: Array, same: Array) -> Array:
     """`part` of an array, read from the whole as `same`, which saves a copy of the part; but its
     slopes are those of the part: what is read from a whole adds slopes to all of it."""
-    floats = jnp.issubdtype(part.dtype, jnp.floating)
-    return _value_like(part, lax.stop_gradient(same)) if floats else same
+    return _value_like(part, same) if jnp.issubdtype(part.dtype, jnp.floating) else same
 
 
 # Why not plain `same`: the loop over groups reads its part from one whole array. In reverse mode
@@ -100,8 +99,10 @@ def like(part: Array, same: Array) -> Array:
 # for every part. The part itself is an input of the loop, whose slopes are stacked as they come. So
 # values come from the whole (no copy: a tenth of the time where only the mean is computed) and
 # slopes go to the part. Example: whole = [a, b, c, d], part = [c, d]. like(part, whole[2:]) has the
-# value [c, d] and the slope of `part`; `stop_gradient` above leaves nothing for `whole`. Both are
-# the same numbers, so the derivative is exact. (README.md: "Short steps read from the whole".)
+# value [c, d] and the slope of `part`, and none of `whole`. Both are the same numbers, so the
+# derivative is exact. JAX may drop the rule below once a program has been differentiated (inside of
+# `checkpoint` it does); `same` then has its own slope, which is as right, for the next derivative.
+# (README.md: "Short steps read from the whole".)
 @jax.custom_jvp
 def _value_like(part: Array, same: Array) -> Array:
     del part
@@ -110,7 +111,7 @@ def _value_like(part: Array, same: Array) -> Array:
 
 @_value_like.defjvp
 def _like_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return _value_like(*primals), tangents[0]  # `primals[1]` would end the slopes of the next order
+    return _value_like(*primals), tangents[0]
 
 
 # Why not the derivative of `dynamic_update_slice`: its transpose hands back the slopes of the whole
