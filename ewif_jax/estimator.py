@@ -11,8 +11,8 @@ from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial, marked, prior_in, screen
 from ewif_jax.fast.compiling import QUICK, QUICKEST, quick_jit, transformed
 from ewif_jax.fast.slopes import with_few_slopes
-from ewif_jax.models.components import check_components
 from ewif_jax.latency import on_time
+from ewif_jax.models.components import check_components
 from ewif_jax.streams import float_dtype, given
 from ewif_jax.trial import validated
 from ewif_jax.types import (

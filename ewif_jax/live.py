@@ -17,8 +17,8 @@ from ewif_jax.fast.layout import Frozen, one_run
 from ewif_jax.fast.loops import Loop, over_runs
 from ewif_jax.fast.memo import question_of, remembered
 from ewif_jax.fast.slopes import with_few_slopes
-from ewif_jax.models.components import check_components
 from ewif_jax.latency import on_time
+from ewif_jax.models.components import check_components
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.sensor_range import check_sensor
 from ewif_jax.models.steps import check_steps

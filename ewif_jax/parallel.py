@@ -12,9 +12,9 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.arrival import arrive, initial
 from ewif_jax.estimators.ewif import ewif, growth
+from ewif_jax.latency import on_time
 from ewif_jax.models.components import check_components
 from ewif_jax.models.linearise import need_known_noise
-from ewif_jax.latency import on_time
 from ewif_jax.models.model import Model
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions import passage as way

@@ -12,8 +12,8 @@ from ewif_jax import checks
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian
 from ewif_jax.kernels.triangular import triangularise
-from ewif_jax.models.components import existing
 from ewif_jax.latency import on_time
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,

@@ -10,8 +10,8 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
-from ewif_jax.models.components import existing
 from ewif_jax.latency import on_time
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.linearise import need_model
 from ewif_jax.models.model import Model

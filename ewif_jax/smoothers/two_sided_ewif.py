@@ -9,8 +9,8 @@ from jax import Array, lax
 from ewif_jax import checks
 from ewif_jax.kernels.growth import decayed, exponential
 from ewif_jax.kernels.trees import choose
-from ewif_jax.models.components import existing
 from ewif_jax.latency import on_time
+from ewif_jax.models.components import existing
 from ewif_jax.models.entry import (
     check_covariances_of,
     check_span,
