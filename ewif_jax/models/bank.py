@@ -11,9 +11,10 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.fast.compiling import array
 from ewif_jax.fast.sparse import Pattern, pattern
+from ewif_jax.models.parameters import resolve
 from ewif_jax.models.sensors import Sensor, wrap_angle
 from ewif_jax.models.tables import different, select, wider, wider_cov
-from ewif_jax.types import Numbers, Params
+from ewif_jax.types import Numbers, Parameter, Params
 
 
 class Bank(NamedTuple):
@@ -27,6 +28,7 @@ class Bank(NamedTuple):
     offset: (params, sensor, t) -> (m,) of z = H x + offset, or None
     count: of sensors
     sizes: how many components each has, or None where all have as many
+    latency: (S,) seconds by which the stamps of each are late, or a function of params; or None
     """
 
     observe: Callable[..., Array]
@@ -36,6 +38,7 @@ class Bank(NamedTuple):
     offset: Callable[..., Array] | None
     count: int
     sizes: tuple[int, ...] | None
+    latency: Parameter
 
 
 def bank(sensors: Sensor | Sequence[Sensor]) -> Bank:
@@ -85,7 +88,20 @@ def bank(sensors: Sensor | Sequence[Sensor]) -> Bank:
         offset if shifted else None,
         len(group),
         different(sizes),
+        _latency_of(group),
     )
+
+
+def _latency_of(group: Sequence[Sensor]) -> Parameter:
+    latencies = [s.latency for s in group]
+    if not any(map(callable, latencies)):
+        known = np.asarray(latencies, float)
+        return known if known.any() else None
+
+    def latency(params: Params) -> Array:
+        return jnp.stack([jnp.asarray(resolve(x, params)) for x in latencies])
+
+    return latency
 
 
 def _chosen(values: list[Any], index: Numbers) -> Any:

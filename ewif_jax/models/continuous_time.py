@@ -149,6 +149,7 @@ def from_continuous(
             group.count,
             check=domain.check_covariances(None, group.cov),
             sizes=group.sizes,
+            latency=group.latency,
         )
     check_seen = seen.check
 

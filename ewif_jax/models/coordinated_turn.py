@@ -108,6 +108,7 @@ def coordinated_turn(
         sensors=group.count,
         check=check,
         sizes=group.sizes,
+        latency=group.latency,
     )
 
 

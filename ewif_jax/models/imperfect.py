@@ -55,7 +55,7 @@ def biased(sensor: Sensor, bias: Parameter) -> Sensor:
         return own if sensor.offset is None else sensor.offset(params, t) + own
 
     linear = sensor.matrix is not None
-    return Sensor(observe, sensor.cov, sensor.angle, sensor.matrix, offset if linear else None)
+    return sensor._replace(observe=observe, offset=offset if linear else None)
 
 
 @from_recipe

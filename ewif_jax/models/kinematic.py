@@ -134,6 +134,7 @@ def _kinematic_model(
         check=check,
         returns_well=True,
         sizes=group.sizes,
+        latency=group.latency,
     )
 
 

@@ -70,7 +70,7 @@ class _ModelFields(NamedTuple):
     returns_well: bool = False
     sizes: tuple[int, ...] | None = None
     jitter: Callable[..., Array] | None = None
-    latency: Callable[..., Numbers] | None = None
+    latency: Parameter = None
 
 
 class Model(FromRecipe, _ModelFields):
@@ -92,7 +92,8 @@ class Model(FromRecipe, _ModelFields):
         and what a sensor lacks is absent (see `models.components`)
     jitter: jitter(params, x, sensor, t) -> (m, m), noise beside measurement_cov that depends on the
         predicted state (see `models.jittered`)
-    latency: latency(params) -> (S,) seconds by which the stamps of each sensor are late, or None
+    latency: (S,) seconds by which the stamps of each sensor are late, or a function of params that
+        gives them; or None
     """
 
 

@@ -23,12 +23,14 @@ class _SensorFields(NamedTuple):
     angle: tuple[bool, ...]
     matrix: Callable[[int], np.ndarray] | None = None
     offset: Seen | None = None
+    latency: Parameter = 0.0
 
 
 class Sensor(FromRecipe, _SensorFields):
     """One sensor: observe(params, x, t) -> (m,), cov(params, t) -> (m, m), which of its m
     components are angles, and, if it is linear, matrix(n) -> (m, n) and offset(params, t) -> (m,)
-    (None: zero) of z = H x + offset."""
+    (None: zero) of z = H x + offset; latency, seconds by which its stamps are late, a number or a
+    function of `params`."""
 
 
 @from_recipe
@@ -37,6 +39,7 @@ def sensor(
     cov: Parameter,
     size: int = 1,
     angle: bool | Sequence[bool] | None = None,
+    latency: Parameter = 0.0,
 ) -> Sensor:
     r"""A sensor of your own, :math:`z = h(x, t) + v`.
 
@@ -47,9 +50,12 @@ def sensor(
         size: how many numbers it says.
         angle: which of them are angles in radians, (size,) booleans, or one for all; None: none.
             Their differences are wrapped into (-pi, pi].
+        latency: seconds by which its stamps are late, a number or a function of `params`; every
+            entry takes them out of the times, see `corrected`.
 
     Raises:
-        ValueError: a cov that is no covariance of `size` numbers, an angle of another length; when
+        ValueError: a cov that is no covariance of `size` numbers, an angle of another length, a
+            latency that is not a finite number; when
             it is used, an `observe` that gives another shape.
     """
     checks.require(callable(observe), "observe", "a function (params, x, t)", repr(observe))
@@ -58,13 +64,16 @@ def sensor(
     flags = np.zeros(m, bool) if flags is None else np.asarray(flags)
     checks.require(flags.dtype == bool, "angle", f"{m} booleans", angle)
     checks.shape("angle", flags, (m,))
+    if not callable(latency):
+        checks.shape("latency", latency, ())
+        checks.finite("latency", latency)
 
     def seen(params: Params, x: Array, t: Array) -> Array:
         value = observe(params, x, t)
         checks.shape("observe", value, (m,))
         return value
 
-    return Sensor(seen, noise_cov("cov", cov, m), tuple(map(bool, flags)))
+    return Sensor(seen, noise_cov("cov", cov, m), tuple(map(bool, flags)), latency=latency)
 
 
 @from_recipe

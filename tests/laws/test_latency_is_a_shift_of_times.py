@@ -173,3 +173,37 @@ def test_corrected_gives_the_times_alone():
     np.testing.assert_array_equal(got.time, TIMES - LATENCY[SENSORS])
     assert got.value is STREAM.value
     assert np.asarray(ej.corrected(STREAM, 0.25).time).dtype == np.float64
+
+
+def late_bank(latency):
+    """The sensors of `MODEL`, of which the second knows its own latency."""
+
+    def second(params, x, t):
+        return x[:1]
+
+    own = ej.models.sensor(second, lambda p: p["r"], latency=latency)
+    return ej.models.constant_velocity(sensors=[SENSOR_PAIR[0], own], q=lambda p: p["q"])
+
+
+def test_a_sensor_may_know_its_own_latency():
+    """In every entry: `run`, `run_batch`, `step`, `step_batch`, smoothers."""
+    params, at = {**PARAMS, "late": 0.93}, {"prior": PRIOR, "t0": T0}
+    plain, known, tuned = (late_bank(x) for x in (0.0, 0.93, lambda p: p["late"]))
+    expected = ej.run(ej.replay(ej.extended(plain), 4), params, SHIFTED, **at)
+    for model in (known, tuned):
+        estimator = ej.replay(ej.extended(model), 4)
+        same(ej.run(estimator, params, STREAM, **at), expected)
+        state = estimator.init(params, PRIOR, jnp.asarray(T0))
+        many = jax.tree.map(lambda x: x[None], state)
+        for row in ej.arrivals(STREAM):
+            state, _ = ej.step(estimator, params, state, row)
+            many, _ = ej.step_batch(
+                estimator, params, many, jax.tree.map(lambda x: np.asarray(x)[None], row)
+            )
+        same(state, expected.final_state)
+        same(jax.tree.map(lambda x: x[0], many), expected.final_state, 1e-9)
+        same(ej.rts(model, params, STREAM, **at), ej.rts(plain, params, SHIFTED, **at))
+    biased = ej.models.biased(ej.models.sensor(lambda p, x, t: x[:1], 1.0, latency=0.5), 0.1)
+    assert biased.latency == 0.5
+    with pytest.raises(ValueError, match="latency: expected None, since"):
+        ej.run(ej.extended(known), params, STREAM, latency=0.1, **at)
