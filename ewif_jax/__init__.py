@@ -42,6 +42,7 @@ from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.fading import fading
 from ewif_jax.estimators.gated import gated
 from ewif_jax.estimators.guided import guided
+from ewif_jax.estimators.imm import imm, imm_probabilities
 from ewif_jax.estimators.information import information
 from ewif_jax.estimators.iterated_extended import iterated_extended
 from ewif_jax.estimators.kalman import kalman
@@ -156,6 +157,8 @@ __all__ = [
     "gain_history",
     "gated",
     "guided",
+    "imm",
+    "imm_probabilities",
     "information",
     "inputs",
     "iterated_extended",

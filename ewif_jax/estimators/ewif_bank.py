@@ -18,6 +18,7 @@ from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
+from ewif_jax.recursions.mixtures import log_sum, mixed_moments, normalised_weights
 from ewif_jax.types import (
     DTypeLike,
     Estimator,
@@ -123,13 +124,13 @@ def ewif_bank(model: Model, taus: Parameter, forgetting: Parameter = 0.98) -> Es
         # bound is about (docs/decisions/estimators.md: "A bank forgets by sharing, not by
         # flattening").
         shared = _shared_weights(state.log_weights, share)
-        within = _normalised_weights(jnp.where(is_awake, shared, -jnp.inf))
+        within = normalised_weights(jnp.where(is_awake, shared, -jnp.inf))
         told = jnp.where(is_awake, infos.log_likelihood, 0)
-        total = _log_sum(jnp.where(is_awake, within + told, -jnp.inf))
+        total = log_sum(jnp.where(is_awake, within + told, -jnp.inf))
         # What nobody can predict, or all find impossible, teaches nothing about the members.
         teaches = jnp.any(is_awake) & jnp.isfinite(total)
         learnt = jnp.where(is_awake, shared + told - jnp.where(teaches, total, 0), shared)
-        weights = _normalised_weights(jnp.where(teaches, learnt, state.log_weights))
+        weights = normalised_weights(jnp.where(teaches, learnt, state.log_weights))
         info = _mixed_info(infos, jnp.exp(within), is_awake, total, measurement.mask)
         return BankState(state.time, members, weights), info
 
@@ -137,8 +138,8 @@ def ewif_bank(model: Model, taus: Parameter, forgetting: Parameter = 0.98) -> Es
         del params
         means, covs = jax.vmap(form.estimate)(state.members)
         is_awake = jax.vmap(form.determined)(state.members)
-        weights = jnp.exp(_normalised_weights(jnp.where(is_awake, state.log_weights, -jnp.inf)))
-        mean, cov = _mixed_moments(weights, is_awake, means, covs)
+        weights = jnp.exp(normalised_weights(jnp.where(is_awake, state.log_weights, -jnp.inf)))
+        mean, cov = mixed_moments(weights, is_awake, means, covs)
         any_awake = jnp.any(is_awake)
         return Gaussian(jnp.where(any_awake, mean, jnp.nan), jnp.where(any_awake, cov, jnp.nan))
 
@@ -186,38 +187,9 @@ def _shared_weights(log_weights: Array, forgetting: Array) -> Array:
     return jnp.where(shares | jnp.isnan(forgetting), mixed, log_weights)
 
 
-def _log_sum(x: Array) -> Array:
-    """log sum exp of numbers of which some may be -inf; -inf of nothing, with derivative 0."""
-    highest = jnp.max(x)
-    level = jnp.where(jnp.isfinite(highest), highest, 0)
-    level = jax.lax.stop_gradient(level)
-    total = jnp.sum(
-        jnp.where(jnp.isfinite(x), jnp.exp(jnp.where(jnp.isfinite(x), x, 0) - level), 0)
-    )
-    return jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1)) + level, -jnp.inf)
-
-
-def _normalised_weights(log_weights: Array) -> Array:
-    total = _log_sum(log_weights)
-    return log_weights - jnp.where(jnp.isfinite(total), total, 0)
-
-
-def _mixed_moments(
-    weights: Array, is_awake: Array, means: Array, covs: Array
-) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of a mixture of those members that know the state."""
-    means = jnp.where(is_awake[:, None], means, 0)
-    covs = jnp.where(is_awake[:, None, None], covs, 0)
-    mean = jnp.sum(weights[:, None] * means, 0)
-    apart = jnp.where(is_awake[:, None], means - mean[None], 0)
-    # The law of total covariance: means that disagree are uncertainty too.
-    spread = covs + apart[:, :, None] * apart[:, None, :]
-    return mean, jnp.sum(weights[:, None, None] * spread, 0)
-
-
 def _mixed_info(infos: Info, weights: Array, is_awake: Array, total: Array, mask: Array) -> Info:
     """The mixture's `Info`: NaN innovation and log likelihood 0 while no member predicts."""
-    innovation, cov = _mixed_moments(weights, is_awake, infos.innovation, infos.innovation_cov)
+    innovation, cov = mixed_moments(weights, is_awake, infos.innovation, infos.innovation_cov)
     any_awake = jnp.any(is_awake)
     is_used = any_awake & jnp.any(infos.status == Status.USED)
     # Of what is absent, exactly 0 and the identity: weights sum to 1 up to rounding only.

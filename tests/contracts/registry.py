@@ -221,6 +221,13 @@ ROWS = (
         refuses="asd",
         variant=True,
     ),
+    Row(
+        "imm",
+        lambda model: ej.imm(
+            [ej.kalman(model), ej.fading(model, of("fading"))],
+            lambda p, t0, t1: jnp.exp(t0 - t1) * jnp.eye(2) + (1 - jnp.exp(t0 - t1)) / 2,
+        ),
+    ),
     Row("fixed_lag", lambda model: fixed_lag(model, 2)),
     Row("bootstrap", lambda model: bootstrap(model, 64), needs_key=True, differentiable=False),
     Row("guided", lambda model: ej.guided(model, 64), needs_key=True, differentiable=False),

@@ -1,4 +1,5 @@
-"""filterpy's `KalmanFilter(alpha=a)` is Anderson's filter (5-13)-(5-15) (ERRATA 17)."""
+"""filterpy's `KalmanFilter(alpha=a)` is Anderson's filter (5-13)-(5-15) (ERRATA 17), and its
+`IMMEstimator` mixes models as `imm` does."""
 
 import numpy as np
 import pytest
@@ -32,3 +33,29 @@ def test_fading_filter(alpha):
         np.testing.assert_allclose(trace.cov[k], theirs.P, rtol=1e-10, atol=1e-14)
         np.testing.assert_allclose(trace.info.innovation_cov[k], theirs.S, rtol=1e-10, atol=1e-14)
         np.testing.assert_allclose(trace.info.log_likelihood[k], theirs.log_likelihood, rtol=1e-9)
+
+
+def test_interacting_multiple_models():
+    rng = np.random.default_rng(1)
+    F, H, R = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.eye(1)
+    noises = [np.diag([1e-3, 1e-3]), np.array([[0.2, 0.5], [0.5, 2.0]])]
+    change, start = np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([0.6, 0.4])
+    values = np.cumsum(rng.normal(size=(25, 1)), 0)
+    theirs = []
+    for Q in noises:
+        one = filterpy.KalmanFilter(dim_x=2, dim_z=1)
+        one.x, one.P = np.array([[1.0], [0.0]]), np.diag([2.0, 3.0])
+        one.F, one.H, one.Q, one.R = F, H, Q, R
+        theirs.append(one)
+    both = filterpy.IMMEstimator(theirs, start.copy(), change)
+    modes = ej.imm([ej.kalman(ej.linear_model(F, H, R, Q)) for Q in noises], change, start)
+    prior = ej.Gaussian(np.array([1.0, 0.0]), np.diag([2.0, 3.0]))
+    state = modes.init(None, prior, 0.0)
+    for arrival in ej.arrivals(ej.stream(np.arange(1.0, 26.0), values)):
+        state, _ = ej.step(modes, None, state, arrival)
+        both.predict()
+        both.update(arrival.value)
+        mean, cov = modes.estimate(None, state)
+        np.testing.assert_allclose(mean, both.x[:, 0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(cov, both.P, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(ej.imm_probabilities(state), both.mu, rtol=1e-9)
