@@ -76,6 +76,7 @@ KINDS = {
     "square_root": ej.square_root,
     "information": ej.information,
     "extended": ej.extended,
+    "iterated_extended": ej.iterated_extended,
     "unscented": ej.unscented,
 }
 ALWAYS = ("kalman", "information")

@@ -27,6 +27,9 @@ ESTIMATORS = {
     "ewif_bank": lambda: ej.ewif_bank(GIVEN.model, (1.0, 3.0)),
     "extended": lambda: ej.extended(GIVEN.model),
     "unscented": lambda: ej.unscented(GIVEN.model),
+    "iterated_extended": lambda: ej.iterated_extended(GIVEN.model),
+    "nonlinear ewif": lambda: ej.ewif(GIVEN.model, 2.0, linearisation="extended"),
+    "guided": lambda: ej.guided(GIVEN.model, SIZE),
     "ensemble": lambda: ej.ensemble(GIVEN.model, SIZE),
     "enkf2": lambda: ej.enkf2(GIVEN.model, SIZE, LAG),
     "bootstrap": lambda: ej.bootstrap(GIVEN.model, SIZE),
@@ -41,7 +44,7 @@ ESTIMATORS = {
     "fixed_lag_ewif": lambda: ej.fixed_lag_ewif(GIVEN.model, 2.0, lag=0.3),
 }
 ALWAYS = ("ewif", "ensemble", "bootstrap", "asd", "replay", "selective")
-NEEDS_KEY = ("ensemble", "enkf2", "bootstrap", "pf_extended")
+NEEDS_KEY = ("ensemble", "enkf2", "bootstrap", "guided", "pf_extended")
 
 
 def go(estimator, data, params=None, prior=GIVEN.prior, key=None):
