@@ -54,7 +54,7 @@ def chain_of(transition: Parameter, count: int, dt: float, max_steps: int) -> Ch
         check_chances(transition, count)
         one_step = np.array(transition, float)
     # Powers of an F: nothing else is asked of a chain over many steps.
-    moved = motion(one_step, None, None, steps)
+    moved = motion(one_step, None, None, None, steps)
     return Chain(moved.F, moved.steps)
 
 
