@@ -14,9 +14,11 @@ from ewif_jax.models.model import Model, resolve
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import information as form
 from ewif_jax.recursions.contract import Recursion, estimator_from
+from ewif_jax.recursions.directional import directional as forgetting_by_direction
 from ewif_jax.recursions.information import InformationState
 from ewif_jax.recursions.invertible import refuse_exact, refuse_one_way
-from ewif_jax.recursions.linearised import Linearisation, sight_around, transport_around
+from ewif_jax.recursions.linearised import Linearisation
+from ewif_jax.recursions.lines import lines_of
 from ewif_jax.types import Estimator, Gaussian, Info, Measurement, Parameter, Params, RandomKey
 
 
@@ -27,6 +29,7 @@ def ewif(
     *,
     weight: Callable[..., Array] | None = None,
     linearisation: Linearisation | None = None,
+    directional: bool = False,
 ) -> Estimator:
     r"""The least-squares estimate in which a measurement of age s counts exp(-s / tau).
 
@@ -53,6 +56,7 @@ def ewif(
             or "sigma-points", the straight line through 2n points of the current covariance
             (cubature), with what the line leaves over added to R, or to the covariance after a
             motion.
+        directional: forget only in the directions in which measurements come in (with tau).
 
     **Nonlinear models.** A late measurement is looked at once, from the current mean carried back
     to its time: A is the derivative of that motion, H that of the sensor there. What an earlier
@@ -64,6 +68,21 @@ def ewif(
     order always matters (0.4 of a standard deviation in that test). `prior=None` is refused,
     because there is no mean to draw a line at; after a gap that forgets everything the lines are
     derivatives, at where the last estimate has moved to.
+
+    **Directional forgetting.** With `directional=True` nothing fades with time. A measurement in
+    sequence forgets what it sees anew, and nothing else: of the information matrix I
+
+    .. math::
+        I \leftarrow I - (1 - w)\, I V' (V I V')^{-1} V I, \quad w = e^{-s/\tau},
+
+    with V a basis of the rows of H and s the time since their directions were last seen (SIFt:
+    Lai & Bernstein 2024, arXiv 2404.10844). A gap loses nothing, and a direction never seen keeps
+    its prior. A late measurement is added, its R counting exp(age / tau) as much, and forgets
+    nothing, so that its order matters. Directions are those of the state's coordinates: where a
+    row of H mixes components, their units matter. What only the motion makes visible is never
+    forgotten: of positions alone, a velocity is taken to be constant. So it is for numbers that
+    stand nearly still (biases, gains, calibrations) and are seen some of the time; for a target
+    that manoeuvres take the plain filter.
 
     `init` accepts `prior=None` (nothing is known about the state): `estimate` is then NaN until
     the measurements determine the state to rounding, and the log likelihood of the measurements up
@@ -83,18 +102,24 @@ def ewif(
     Reduces to: `kalman` without process noise as tau grows; `fading` with inflation exp(dt / tau)
         and Q = 0; least squares over all the data (8)-(9). With `linearisation`: the EWIF of the
         matrices if the model is linear; `extended` without process noise as tau grows (and
-        `unscented`, for one state).
+        `unscented`, for one state). With `directional`: the plain filter where every measurement
+        sees every direction; without forgetting as tau grows.
 
     Deviations: known inputs enter both the transport of the old estimate and the residual of a
         late measurement (the paper sets them to zero after (10)). The covariance is the paper's P,
-        which is not the covariance of the error under its model (3).
+        which is not the covariance of the error under its model (3). SIFt forgets over one step
+        whatever has passed, and leaves out directions of little excitation by a threshold of the
+        user's; here a direction forgets over the time since it was seen, and is left out where it
+        is rounding.
 
     Raises:
         ValueError: both or neither of `tau` and `weight`; a tau that is not one number > 0; a
             model that is not linear, without `linearisation`; `prior=None` with one; a singular R;
-            a constant F without inverse.
+            a constant F without inverse; `directional` with a weight.
     """
     kind = _kind_of(model, linearisation)
+    by_tau = not directional or weight is None
+    checks.require(by_tau, "directional", "a `tau` and no `weight` to go with it", "a `weight`")
     need_reversible(model, "ewif")
     one = (tau is None) != (weight is None)
     checks.require(one, "tau", "one of `tau` and `weight`", (tau, weight))
@@ -117,18 +142,18 @@ def ewif(
         refuse_one_way(model, params, "ewif")
         return form.start(model, params, prior, t0)
 
-    growing = growth(tau, weight)
+    growing, lines = growth(tau, weight), lines_of(model, kind)
+
+    def decay(params: Params, time: Array) -> Array:
+        return jnp.asarray(checks.positive("tau", resolve(tau, params)), time.dtype)
 
     def move(params: Params, state: InformationState, time: Array) -> InformationState:
         def fade(variances: Array) -> Array:
             if tau is None:
                 return grown(variances, growing(params, state.time, time))
-            decay = jnp.asarray(checks.positive("tau", resolve(tau, params)), time.dtype)
-            return decayed(variances, time - state.time, decay)
+            return decayed(variances, time - state.time, decay(params, time))
 
-        if kind is not None:
-            return transport_around(kind, model, params, state, time, fade)
-        return form.transport(model, params, state, time, fade)
+        return lines.transport(params, state, time, fade)
 
     def measure(
         params: Params, state: InformationState, measurement: Measurement
@@ -136,10 +161,8 @@ def ewif(
         # W of a late measurement at the state's time: its R counts 1 / W^2 as much (36). Nothing
         # else is special about it, since without process noise a motion back is exact.
         faded = growing(params, measurement.time, state.time)
-        if kind is not None:
-            found = sight_around(kind, model, params, state, measurement, faded)
-            return form.absorb_sight(state, found, measurement, faded)
-        return form.absorb(model, params, state, measurement, faded)
+        found = lines.look(params, state, measurement, faded)
+        return form.absorb_sight(state, found, measurement, faded)
 
     def estimate(params: Params, state: InformationState) -> Gaussian:
         del params
@@ -153,7 +176,10 @@ def ewif(
     recursion = recursion._replace(
         moves_back=True, starts_from_nothing=True, inverts_prior=True, keeps=True
     )
-    return estimator_from(recursion._replace(model=without_process_noise(model)))
+    recursion = recursion._replace(model=without_process_noise(model))
+    if directional:
+        recursion = forgetting_by_direction(recursion, lines, growing, decay)
+    return estimator_from(recursion)
 
 
 def _kind_of(model: Model, linearisation: Linearisation | None) -> Linearisation | None:

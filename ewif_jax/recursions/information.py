@@ -101,8 +101,8 @@ def transport(
 def moved(
     state: InformationState, ahead: Array, back: Array, noise: Array | None = None
 ) -> InformationState:
-    """The equations of a state whose reference has moved by `ahead` (n, n); `back`, its inverse, is
-    needed only while something is unknown.
+    """The equations of a state whose reference has moved by `ahead` (n, n), with `noise` (n, k) of
+    covariance L L' added; `back`, the inverse, is needed only while something is unknown.
 
     What is known of everything moves as a covariance, with no way back: there a motion that is
     stable and fast makes the certain more certain, and takes nothing from the rest.
@@ -118,8 +118,8 @@ def moved(
     if noise is None:
         kept, rows = spread(vectors, variances)
     else:
-        # F P F' + L L' is a sum over 2n independent errors: process noise is n more columns.
-        both = jnp.concatenate([variances, jnp.ones_like(variances)])
+        # F P F' + L L' is a sum over n + k independent errors: process noise is k more columns.
+        both = jnp.concatenate([variances, jnp.ones(noise.shape[1], variances.dtype)])
         kept, rows = spread(jnp.concatenate([vectors, noise], 1), both, certain=True)
     targets = equations.times(rows, error)
     certain = state._replace(variances=kept, rows=rows, targets=targets)
@@ -133,16 +133,17 @@ def moved(
         partial = gathered(nothing, told, spreads, state.targets, sizes)
     else:
         # Of (u, x) with noise L u, u of unit variance: u is eliminated by coming first.
-        eye, zeros = jnp.eye(n, dtype=back.dtype), jnp.zeros((n, n), back.dtype)
+        k = noise.shape[1]
+        eye, zeros = jnp.eye(k, dtype=back.dtype), jnp.zeros((k, n), back.dtype)
         wide = jnp.concatenate(
             [jnp.concatenate([eye, zeros], 1), jnp.concatenate([-matmul(told, noise), told], 1)]
         )
-        none = jnp.zeros(2 * n, back.dtype)
+        none = jnp.zeros(k + n, back.dtype)
         both = gathered(
             state._replace(mean=none, **_nothing(none)),
             wide,
-            jnp.concatenate([jnp.ones_like(spreads), spreads]),
-            jnp.concatenate([jnp.zeros_like(state.targets), state.targets]),
+            jnp.concatenate([jnp.ones(k, spreads.dtype), spreads]),
+            jnp.concatenate([jnp.zeros(k, back.dtype), state.targets]),
             jnp.concatenate(
                 [
                     jnp.concatenate([eye, zeros], 1),
@@ -151,9 +152,9 @@ def moved(
             ),
         )
         partial = state._replace(
-            variances=both.variances[n:],
+            variances=both.variances[k:],
             rows=both.rows[both.rows.shape[0] - state.rows.shape[0] :],
-            targets=both.targets[n:],
+            targets=both.targets[k:],
         )
     return choose(determined(state), certain, partial)
 

@@ -29,7 +29,7 @@ def transport_around(
     params: Params,
     state: InformationState,
     time: Array,
-    fade: Fade,
+    fade: Fade | None,
 ) -> InformationState:
     """`information.transport` of a nonlinear model, in either direction.
 
@@ -54,8 +54,9 @@ def transport_around(
         there = jnp.where(is_known, shifted, there)
         ahead = jnp.where(is_known, _slope_along_axes(line.slope, state), ahead)
         noise = jnp.where(is_known, cholesky.factor(line.left_over).lower, 0)
-    gone = state._replace(time=time, mean=there, variances=fade(state.variances))
-    return choose(is_still, state, moved(gone, ahead, back, noise))
+    variances = state.variances if fade is None else fade(state.variances)
+    faded = state._replace(time=time, mean=there, variances=variances)
+    return choose(is_still, state, moved(faded, ahead, back, noise))
 
 
 def sight_around(

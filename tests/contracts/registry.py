@@ -107,6 +107,14 @@ ROWS = (
         accepts_no_prior=True,
         predicts_back=True,
     ),
+    Row(
+        "ewif_directional",
+        lambda model: ej.ewif(model, of("tau"), directional=True),
+        late=Status.LATE_USED,
+        any_age=True,
+        accepts_no_prior=True,
+        predicts_back=True,
+    ),
     *(
         Row(
             f"ewif_{kind}",
