@@ -82,6 +82,6 @@ def bootstrap(
         return state._replace(log_weights=log_weights), info
 
     recursion = Recursion(
-        "bootstrap", start, form.mover(kind), measure, form.estimate_of_cloud, model=model
+        "bootstrap", start, form.mover(kind), measure, form.estimator_of_cloud(model), model=model
     )
     return estimator_from(recursion._replace(draws=True, estimated=("particles",)))

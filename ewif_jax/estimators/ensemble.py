@@ -87,7 +87,7 @@ def ensemble(
 
     def estimate(params: Params, state: EnsembleState) -> Gaussian:
         del params
-        return ensembles.sample_moments(state.members)
+        return ensembles.sample_moments(state.members, model.state_angle)
 
     recursion = Recursion("ensemble", start, move, measure, estimate, model=model)
     return estimator_from(recursion._replace(draws=True, estimated=("members",)))

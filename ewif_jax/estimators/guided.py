@@ -136,7 +136,9 @@ def guided(
         new = GuidedState(state.time, drawn.particles, log_weights, key, drawn.particles, root)
         return new, info
 
-    recursion = Recursion("guided", start, move, measure, form.estimate_of_cloud, model=model)
+    recursion = Recursion(
+        "guided", start, move, measure, form.estimator_of_cloud(model), model=model
+    )
     return estimator_from(recursion._replace(draws=True, estimated=("particles",)))
 
 

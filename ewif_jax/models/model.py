@@ -71,6 +71,7 @@ class _ModelFields(NamedTuple):
     sizes: tuple[int, ...] | None = None
     jitter: Callable[..., Array] | None = None
     latency: Parameter = None
+    state_angle: tuple[bool, ...] | None = None
 
 
 class Model(FromRecipe, _ModelFields):
@@ -94,6 +95,9 @@ class Model(FromRecipe, _ModelFields):
         predicted state (see `models.jittered`)
     latency: (S,) seconds by which the stamps of each sensor are late, or a function of params that
         gives them; or None
+    state_angle: (n,) which components of the state are angles in radians (None: none). Sigma
+        points, ensembles, particles and smoothers then compare and average them on the circle, and
+        `transition` may wrap them
     """
 
 

@@ -7,6 +7,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models import Model
+from ewif_jax.models.angles import wrapped_state
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.ensemble_history import Bracket, EnsembleHistory, delayed
@@ -61,7 +62,8 @@ def enkf2(
         if ahead is None:
             drawn = ensembles.process_noise(model, params, key, there, time, state.time)
             ahead = ensembles.carried_members(model, params, there, time, state.time) + drawn
-        return ensembles.uncorrelated(there, _beyond_rounding(now - ahead, now))
+        apart = wrapped_state(model.state_angle, now - ahead)
+        return ensembles.uncorrelated(there, _beyond_rounding(apart, now), model.state_angle)
 
     return delayed(model, "enkf2", members, lag, retrodict, forecasts=noise == "shared")
 

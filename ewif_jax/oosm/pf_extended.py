@@ -13,6 +13,7 @@ from ewif_jax.kernels import cholesky, retrodiction
 from ewif_jax.kernels.resampling import Resampling
 from ewif_jax.kernels.trees import copies
 from ewif_jax.models import Model, predict_state
+from ewif_jax.models.angles import state_difference
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
@@ -135,7 +136,9 @@ def pf_extended(
         )
         return state._replace(**cloud._asdict(), used=jnp.asarray(True), past=past), info
 
-    recursion = Recursion("pf_extended", start, move, measure, form.estimate_of_cloud, within_lag)
+    recursion = Recursion(
+        "pf_extended", start, move, measure, form.estimator_of_cloud(model), within_lag
+    )
     recursion = recursion._replace(draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))
 
@@ -160,7 +163,9 @@ def _drawn_between(
         arrived, F, Q_after = predict_state(model, params, there, time, end)
         gain, left_over = retrodiction.bridge(Q_before, dense(F), Q_after)
         root = cholesky.factor(left_over).lower
-        return there + matvec(gain, target - arrived) + matvec(root, normals)
+        return (
+            there + matvec(gain, state_difference(model, target, arrived)) + matvec(root, normals)
+        )
 
     normals = jax.random.normal(key, state.particles.shape, state.particles.dtype)
     return jax.vmap(draw, -1, -1)(before, after, normals)

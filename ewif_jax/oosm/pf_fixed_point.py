@@ -153,10 +153,10 @@ def pf_fixed_point(
         seen, key = lax.cond(is_late, smoothed, in_sequence, state)
         log_weights, info = weighing.weigh(state, seen, measurement, collapse)
         weighed = state._replace(log_weights=log_weights, key=key)
-        return _remembered_summary(weighed, measurement), info
+        return _remembered_summary(model, weighed, measurement), info
 
     recursion = Recursion(
-        "pf_fixed_point", start, form.mover(kind), measure, form.estimate_of_cloud
+        "pf_fixed_point", start, form.mover(kind), measure, form.estimator_of_cloud(model)
     )
     recursion = recursion._replace(reach=within_lag, draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))
@@ -175,7 +175,7 @@ def _look_through(
     time, value, sensor, mask = measurement
 
     def seen_through(x: Array) -> tuple[Array, Array, Array, Array, Array]:
-        there = given(past, x)
+        there = given(model, past, x)
         predicted, H, R = predict_measurement(model, params, there.mean, sensor, time)
         checks.shape("measurement.value", value, (R.shape[0],))
         difference = jnp.where(mask, model.residual(value, predicted, sensor), 0)
@@ -195,10 +195,12 @@ def _look_through(
     )
 
 
-def _remembered_summary(state: SummaryState, measurement: Measurement) -> SummaryState:
+def _remembered_summary(
+    model: Model, state: SummaryState, measurement: Measurement
+) -> SummaryState:
     """The state with its present mean and covariance in place of those of the same time, or, after
     an in-sequence measurement or at a new time, in front of them."""
-    mean, cov = form.summary(state)
+    mean, cov = form.summary(model, state)
     now = CovarianceState(state.time, mean, symmetric.pack(cov))
     late = measurement.time < state.time
     taken = measurement._replace(time=state.time, mask=measurement.mask & ~late)

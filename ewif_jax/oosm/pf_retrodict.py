@@ -85,6 +85,8 @@ def pf_retrodict(
         log_weights, info = weighing.weigh(drawn, seen, measurement, collapse)
         return drawn._replace(log_weights=log_weights), info
 
-    recursion = Recursion("pf_retrodict", start, form.mover(kind), measure, form.estimate_of_cloud)
+    recursion = Recursion(
+        "pf_retrodict", start, form.mover(kind), measure, form.estimator_of_cloud(model)
+    )
     recursion = recursion._replace(reach=any_age, draws=True, estimated=("particles",))
     return estimator_from(recursion._replace(model=model))

@@ -9,6 +9,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, predict_state
+from ewif_jax.models.angles import state_difference
 from ewif_jax.oosm.parts.history import HistoryState, one_step
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.covariance import CovarianceState
@@ -114,7 +115,7 @@ def _one_step_behind(model: Model, params: Params, tie: Tie, slot: CovarianceSta
     cov = symmetric.congruence(G, tie.cov + symmetric.pack(Q))
     return Tie(
         slot.time,
-        slot.mean + matvec(G, tie.mean - predicted),
+        slot.mean + matvec(G, state_difference(model, tie.mean, predicted)),
         matmul(G, tie.A),
         cov + symmetric.congruence(rest, slot.cov),
     )

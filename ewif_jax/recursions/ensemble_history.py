@@ -10,6 +10,7 @@ from jax import Array
 from ewif_jax import checks
 from ewif_jax.kernels.trees import choose, copies
 from ewif_jax.models import Model
+from ewif_jax.models.angles import wrapped_state
 from ewif_jax.recursions import ensembles
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.ensembles import EnsembleState
@@ -94,7 +95,11 @@ def delayed(
         own, sight = ensembles.sight_keys(state.sight, measurement.sensor)
         then = jnp.minimum(measurement.time, state.time)
         there = retrodict(
-            params, state, _interpolated_at(state, then), then, ensembles.back_key(state.sight)
+            params,
+            state,
+            _interpolated_at(model, state, then),
+            then,
+            ensembles.back_key(state.sight),
         )
         # Nothing was learned since "now", and a regression on rounding would move the members.
         there = jnp.where(then < state.time, there, state.members)
@@ -105,7 +110,7 @@ def delayed(
 
     def estimate(params: Params, state: EnsembleHistory) -> Gaussian:
         del params
-        return ensembles.sample_moments(state.members)
+        return ensembles.sample_moments(state.members, model.state_angle)
 
     recursion = Recursion(method, start, move, measure, estimate, within_lag, model=model)
     return estimator_from(recursion._replace(draws=True, estimated=("members",)))
@@ -122,7 +127,7 @@ def _pushed_slots(past: Slots, left: EnsembleHistory, now: Array) -> Slots:
     return jax.tree.map(lambda new, old: jnp.concatenate([new[None], old[:-1]]), entry, past)
 
 
-def _interpolated_at(state: EnsembleHistory, time: Array) -> Bracket:
+def _interpolated_at(model: Model, state: EnsembleHistory, time: Array) -> Bracket:
     """Eq. (26) between the newest entry not newer than `time` and the next one, which may be now;
     forecasts likewise."""
     past = state.past
@@ -139,7 +144,10 @@ def _interpolated_at(state: EnsembleHistory, time: Array) -> Bracket:
 
     def between(table: Array) -> Array:
         newest = jnp.where(last, state.members, table[after])
-        return (1 - share) * table[newer] + share * newest
+        # An angle goes the shorter way round.
+        away = newest - table[newer]
+        turns = away - wrapped_state(model.state_angle, away)
+        return (1 - share) * table[newer] + share * (newest - turns)
 
     ahead = None if past.ahead is None else between(past.ahead)
     return Bracket(between(past.members), ahead)

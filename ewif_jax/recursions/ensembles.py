@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, gaussian, symmetric
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models.angles import Angles, centre_of, wrapped_state
 from ewif_jax.models.model import Model
 from ewif_jax.recursions.innovations import are_finite
 from ewif_jax.recursions.sigma_points import view
@@ -111,7 +112,7 @@ def look_of_ensemble(
     """The measurement as predicted by the members `there` (n, N) at its time; `innovation.cross`
     relates it to `members`."""
     sensor, mask = measurement.sensor, measurement.mask
-    middle = mean_of(there)
+    middle = mean_of(there, model.state_angle)
     see, R = view(model, params, sensor, measurement.time, middle)
     origin = see(middle)
     checks.shape("measurement.value", measurement.value, origin.shape)
@@ -133,7 +134,9 @@ def look_of_ensemble(
     cov = sample_spread(deviations) + R
     all_finite = every_offset & are_finite(difference, cov, mask)
     mask = mask & all_finite
-    innovation = gaussian.innovate(difference, sample_cov(deviations, members), cov, mask)
+    innovation = gaussian.innovate(
+        difference, sample_cov(deviations, members, model.state_angle), cov, mask
+    )
     root = cholesky.factor(gaussian.mask_cov(R, mask)).lower
     return EnsembleLook(jnp.where(all_finite, deviations, 0), root, innovation, mask, all_finite)
 
@@ -167,15 +170,23 @@ def transformed_members(members: Array, looked: EnsembleLook) -> Array:
     return members + step[:, None] - matmul(gain, looked.deviations)
 
 
-def mean_of(members: Array) -> Array:
-    """The sample mean (n,) of members (n, N)."""
+def mean_of(members: Array, angle: Angles = None) -> Array:
+    """The sample mean (n,) of members (n, N), that of angles in (-pi, pi]."""
     # About one of them: a sum of large numbers would round away the spread of close ones.
-    return members[:, 0] + jnp.mean(members - members[:, :1], 1)
+    centre = centre_of(angle, members)
+    away = wrapped_state(angle, members - centre[:, None])
+    return wrapped_state(angle, centre + jnp.mean(away, 1))
 
 
-def sample_cov(a: Array, b: Array) -> Array:
-    """The sample covariance (p, q) of a (p, N) with b (q, N), where a has mean zero."""
-    centred = b - mean_of(b)[:, None]
+def deviations_of(members: Array, angle: Angles = None) -> Array:
+    """The members (n, N) less their mean."""
+    return wrapped_state(angle, members - mean_of(members, angle)[:, None])
+
+
+def sample_cov(a: Array, b: Array, angle: Angles = None) -> Array:
+    """The sample covariance (p, q) of a (p, N) with b (q, N), where a has mean zero; of b these are
+    angles."""
+    centred = deviations_of(b, angle)
     return jnp.matmul(a, centred.T, precision=jax.lax.Precision.HIGHEST) / (a.shape[1] - 1)
 
 
@@ -184,10 +195,9 @@ def sample_spread(deviations: Array) -> Array:
     return symmetric.unpack(symmetric.pack(sample_cov(deviations, deviations)))
 
 
-def sample_moments(members: Array) -> Gaussian:
+def sample_moments(members: Array, angle: Angles = None) -> Gaussian:
     """Sample mean (n,) and covariance (n, n) of members (n, N)."""
-    mean = mean_of(members)
-    return Gaussian(mean, sample_spread(members - mean[:, None]))
+    return Gaussian(mean_of(members, angle), sample_spread(deviations_of(members, angle)))
 
 
 def fuse_ensembles(ensembles: Numbers) -> Array:
@@ -225,10 +235,10 @@ def fuse_ensembles(ensembles: Numbers) -> Array:
     return level[0]
 
 
-def uncorrelated(members: Array, d: Array) -> Array:
+def uncorrelated(members: Array, d: Array, angle: Angles = None) -> Array:
     """The members (n, N) less their regression on d (n, N): x_i - P_xd P_dd^-1 d_i."""
     deviations = d - mean_of(d)[:, None]
-    weights = cholesky.solved(sample_spread(deviations), sample_cov(deviations, members))
+    weights = cholesky.solved(sample_spread(deviations), sample_cov(deviations, members, angle))
     return members - matmul(weights.T, d)
 
 

@@ -10,6 +10,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model
+from ewif_jax.models.angles import state_difference
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.sigma_points import SigmaPoints, flow_around, measure_around
 from ewif_jax.types import Gaussian, Measurement, Params
@@ -97,7 +98,7 @@ def fixed_point(
     return Conditional(last.mean[n:], gain, last.mean[:n], cov[n:, n:] - matmul(root.T, root))
 
 
-def given(conditional: Conditional, x: Array) -> Gaussian:
+def given(model: Model, conditional: Conditional, x: Array) -> Gaussian:
     """The mean (n,) and covariance (n, n) of x(tau) if the state now is x (n,)."""
     mean, gain, now, cov = conditional
-    return Gaussian(mean + matvec(gain, x - now), cov)
+    return Gaussian(mean + matvec(gain, state_difference(model, x, now)), cov)

@@ -14,6 +14,7 @@ from ewif_jax.kernels import cholesky, equations, sigma_points
 from ewif_jax.kernels.growth import Fade
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, predict_measurement
+from ewif_jax.models.angles import state_difference
 from ewif_jax.recursions.information import InformationState, determined, moved
 from ewif_jax.recursions.sighting import Sight
 from ewif_jax.recursions.sigma_points import SigmaPoints, regressed_line, view
@@ -49,7 +50,7 @@ def transport_around(
     checks.shape("F", ahead, (state.mean.shape[0],) * 2)
     back, noise = jax.jacfwd(move_back)(there), None
     if kind == "sigma-points":
-        shifted, line = _line_around(move, jnp.subtract, state)
+        shifted, line = _line_around(move, lambda a, b: state_difference(model, a, b), state)
         is_known = determined(state)
         there = jnp.where(is_known, shifted, there)
         ahead = jnp.where(is_known, _slope_along_axes(line.slope, state), ahead)

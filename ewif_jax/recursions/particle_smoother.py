@@ -9,9 +9,11 @@ from jax import Array, lax
 from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model
+from ewif_jax.models.angles import wrapped_state
 from ewif_jax.recursions import particles as form
 from ewif_jax.recursions import weighing
 from ewif_jax.recursions.covariance import CovarianceState
+from ewif_jax.recursions.particles import weighted_moments
 from ewif_jax.recursions.weighing import SeenByCloud
 from ewif_jax.types import Measurement, Params, State
 
@@ -99,10 +101,15 @@ def look_back(
     line_weights = weighing.shares(last.log_weights, found.numbers)
     origin = weighing.stand_in(model, params, found.numbers, last.fixed, line_weights, measurement)
     offsets = weighing.about(model, origin, found.predicted, found.numbers, measurement)
+    angle = model.state_angle
     center = jnp.mean(ahead, 1, keepdims=True)
+    if angle is not None:
+        center = weighted_moments(ahead, line_weights, angle)[0][:, None]
     # White coordinates: with Q = L L' the density of a step is that of a squared distance. About
     # the centre, because squares of large coordinates would leave no digits of their difference.
-    targets, points = (cholesky.forward(f, x - center) for x in (ahead, state.particles))
+    targets, points = (
+        cholesky.forward(f, wrapped_state(angle, x - center)) for x in (ahead, state.particles)
+    )
     best = jnp.max(line_density)
     best = jnp.where(best > -jnp.inf, best, 0)
     density = jnp.exp(line_density - best)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from ewif_jax import checks
@@ -16,6 +17,8 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.kernels.resampling import Resampling, ancestors, effective_sample_size
 from ewif_jax.models import Model
+from ewif_jax.models.angles import Angles, centre_of, wrapped_state
+from ewif_jax.recursions.contract import Report
 from ewif_jax.types import Gaussian, Params, PyTree, State
 
 
@@ -179,24 +182,35 @@ def resampled(
     return jax.tree.map(take, cloud), equal
 
 
-def weighted_moments(x: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of x (n, N) under weights (N,) that sum to one."""
+def weighted_moments(x: Array, weights: Array, angle: Angles = None) -> tuple[Array, Array]:
+    """Mean (n,) and covariance (n, n) of x (n, N) under weights (N,) that sum to one; the mean of
+    angles in (-pi, pi]."""
     # About one particle: rounded weights do not sum to one, which far from the origin would count.
     # Their sum has a derivative (see `resampled`), which goes with the whole of x.
     total = jnp.sum(weights)
-    start = x[:, 0] * (1 + total - lax.stop_gradient(total))
-    apart = x - x[:, :1]
+    centre = centre_of(angle, x, weights)
+    start = centre * (1 + total - lax.stop_gradient(total))
+    if angle is not None:  # an angle has no origin that could be scaled
+        start = jnp.where(np.asarray(angle), centre, start)
+    apart = wrapped_state(angle, x - centre[:, None])
     shift = matmul(apart, weights[:, None])[:, 0]
     spread = apart - shift[:, None]
-    return start + shift, symmetric.unpack(symmetric.pack(matmul(spread * weights[None], spread.T)))
+    return wrapped_state(angle, start + shift), symmetric.unpack(
+        symmetric.pack(matmul(spread * weights[None], spread.T))
+    )
 
 
-def estimate_of_cloud(params: Params, state: State) -> Gaussian:
+def estimator_of_cloud(model: Model) -> Report:
     """The `estimate` of a recursion whose state begins with the fields of `ParticleState`."""
-    del params
-    return summary(state)
+
+    def estimate(params: Params, state: State) -> Gaussian:
+        del params
+        return summary(model, state)
+
+    return estimate
 
 
-def summary(state: State) -> Gaussian:
+def summary(model: Model, state: State) -> Gaussian:
     """Weighted mean (n,) and covariance (n, n) of the particles."""
-    return Gaussian(*weighted_moments(state.particles, jnp.exp(state.log_weights)))
+    weights = jnp.exp(state.log_weights)
+    return Gaussian(*weighted_moments(state.particles, weights, model.state_angle))

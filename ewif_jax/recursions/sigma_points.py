@@ -12,6 +12,7 @@ from ewif_jax.fast.small import matmul
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, gaussian, sigma_points, symmetric
 from ewif_jax.kernels.trees import choose
+from ewif_jax.models.angles import state_difference
 from ewif_jax.models.linearise import noise_at, predict_state
 from ewif_jax.models.model import Model, resolve
 from ewif_jax.models.sensor_range import check_sensor
@@ -207,7 +208,10 @@ def _moved_line(
     def move(x: Array) -> Array:
         return jnp.asarray(model.transition(params, x, t0, t1), x.dtype)
 
-    return regressed_line(move, jnp.subtract, points, params, mean, lower, still)
+    def apart(x: Array, y: Array) -> Array:
+        return state_difference(model, x, y)
+
+    return regressed_line(move, apart, points, params, mean, lower, still)
 
 
 def regressed_line(

@@ -109,9 +109,16 @@ def _noise_of_cloud(
     middle = particles[:, 0]
     if model.jitter is not None:
         finite = jnp.all(jnp.isfinite(particles), 0)
-        weights = shares(log_weights, finite)
-        middle = matmul(jnp.where(finite, particles, 0), weights[:, None])[:, 0]
+        middle = _mean_of_cloud(model, particles, finite, shares(log_weights, finite))
     return noise_at(model, params, middle, measurement.sensor, measurement.time)
+
+
+def _mean_of_cloud(model: Model, particles: Array, finite: Array, weights: Array) -> Array:
+    """The mean (n,) of those particles that are `finite` (N,), under weights that sum to one."""
+    particles, angle = jnp.where(finite, particles, 0), model.state_angle
+    if angle is None:
+        return matmul(particles, weights[:, None])[:, 0]
+    return weighted_moments(particles, weights, angle)[0]
 
 
 def log_density(found: ComparedCloud, mask: Array) -> Array:
@@ -146,7 +153,7 @@ def stand_in(
     wrapped once, however far off it is. Nothing depends on the choice but the cut, so no derivative
     goes through it.
     """
-    middle = matmul(jnp.where(numbers, particles, 0), weights[:, None])[:, 0]
+    middle = _mean_of_cloud(model, particles, numbers, weights)
     seen = model.observe(params, lax.stop_gradient(middle), measurement.sensor, measurement.time)
     seen = lax.stop_gradient(jnp.asarray(seen, particles.dtype))
     return jnp.where(jnp.isfinite(seen), seen, measurement.value)

@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.latency import on_time
+from ewif_jax.models.angles import state_difference
 from ewif_jax.models.components import existing
 from ewif_jax.models.entry import check_covariances_of, check_times
 from ewif_jax.models.linearise import need_model
@@ -143,7 +144,7 @@ def _smoothed_series(
         # Sums of squares. P + G (P_T - P^-) G' subtracts two covariances, which in float32 leaves
         # negative variances where the smoother gains much.
         rest = jnp.eye(G.shape[0], dtype=G.dtype) - matmul(G, moved.F)
-        mean = moved.left + matvec(G, later[0] - moved.predicted)
+        mean = moved.left + matvec(G, state_difference(model, later[0], moved.predicted))
         cov = symmetric.congruence(rest, moved.left_cov)
         cov = cov + symmetric.congruence(G, later[1] + moved.Q)
         return (mean, cov), later

@@ -60,7 +60,7 @@ def test_eks_and_uks_are_the_exact_conditional(kind, n, m):
         conditional = smooth(summary_before(given_problem, data, tau), jnp.asarray(tau))
         x = rng.normal(size=n)
         mean, cov = conditioned(given_problem, data, tau, x)
-        found = given(conditional, jnp.asarray(x))
+        found = given(given_problem.model, conditional, jnp.asarray(x))
         np.testing.assert_allclose(found.mean, mean, atol=tolerance, rtol=tolerance)
         np.testing.assert_allclose(found.cov, cov, atol=tolerance)
 

@@ -11,6 +11,7 @@ from ewif_jax.fast.small import matmul, matvec
 from ewif_jax.fast.sparse import dense
 from ewif_jax.kernels import cholesky, symmetric
 from ewif_jax.models import Model, predict_measurement, predict_state
+from ewif_jax.models.angles import state_difference
 from ewif_jax.models.linearise import predicted_value
 from ewif_jax.recursions.covariance import CovarianceState
 from ewif_jax.recursions.innovations import Compared
@@ -104,7 +105,7 @@ def moved_back(
     predicted, F, Q_all = predict_state(model, params, start.mean, start.time, state.time)
     M = symmetric.congruence(F, start.cov) + symmetric.pack(Q_all)
     Q = jnp.asarray(model.process_cov(params, at, state.time), dtype)
-    moved, origin = state.mean - predicted, state.mean
+    moved, origin = state_difference(model, state.mean, predicted), state.mean
     if noise_estimated and model.linear is None:
         origin = origin - matvec(Q, cholesky.solved(symmetric.unpack(M), moved))
     if not model.returns_well:
