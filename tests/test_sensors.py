@@ -109,6 +109,15 @@ TOLD = {
             AT_2 @ (STATES[0][3:5] - [0.5, 0.4]) / np.linalg.norm(AT_2),
         ],
     ),
+    "a Doppler radar in space": (
+        3,
+        ej.models.range_bearing_rate_sensor(1.0, (*PLACE, 0.1), (0.1, 0.0, 0.0), dims=3),
+        [
+            np.linalg.norm(AWAY),
+            np.arctan2(AWAY[1], AWAY[0]),
+            AWAY @ LEAVING / np.linalg.norm(AWAY),
+        ],
+    ),
     "azimuth, elevation, range": (
         3,
         ej.models.azimuth_elevation_range_sensor(1.0, (*PLACE, 0.1)),

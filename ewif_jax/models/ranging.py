@@ -53,63 +53,71 @@ def range_rate_sensor(
 
 
 @from_recipe
-def bearing_sensor(r: Parameter, position: Place = (0.0, 0.0)) -> Sensor:
+def bearing_sensor(r: Parameter, position: Place = None, dims: int = 2) -> Sensor:
     r"""A sensor of the direction to the target, :math:`\mathrm{atan2}(y - y_s, x - x_s)`, radians.
 
     Args:
         r: noise variance in rad^2, a number or a function of `params`.
-        position: (x_s, y_s) in m, or a function of (params, t), or of `params`.
+        position: (x_s, y_s) in m, or a function of (params, t), or of `params`; None: the origin.
+        dims: number of space dimensions; of more than two the first two count.
 
     Deviations: Pornsarayouth & Yamakita (55) leaves the sensor position out. At the sensor itself
     the bearing is undefined: 0 with a zero gradient.
     """
-    return _looking(r, position, None, 2, (_bearing,))
+    return _looking(r, position, None, _at_least_two(dims), (_bearing,))
 
 
 @from_recipe
-def range_bearing_sensor(r: Parameter, position: Place = (0.0, 0.0)) -> Sensor:
-    """A sensor of range and bearing in the plane: a radar.
+def range_bearing_sensor(r: Parameter, position: Place = None, dims: int = 2) -> Sensor:
+    """A sensor of range and bearing: a radar.
 
     Args:
         r: noise: a variance for both, variances (m^2, rad^2), (2, 2), or a function of `params`.
-        position: as in `bearing_sensor`.
+        position, dims: as in `bearing_sensor`.
 
     Deviations: at the sensor itself as `range_sensor` and `bearing_sensor`.
     """
-    return _looking(r, position, None, 2, (_range, _bearing))
+    return _looking(r, position, None, _at_least_two(dims), (_range, _bearing))
 
 
 @from_recipe
 def range_bearing_rate_sensor(
-    r: Parameter, position: Place = (0.0, 0.0), velocity: Place = None
+    r: Parameter, position: Place = None, velocity: Place = None, dims: int = 2
 ) -> Sensor:
-    """A sensor of range, bearing and range rate in the plane: a Doppler radar.
+    """A sensor of range, bearing and range rate: a Doppler radar.
 
     Args:
         r: noise: a variance for all, variances (m^2, rad^2, m^2/s^2), (3, 3), or a function of
             `params`.
-        position: as in `bearing_sensor`.
+        position, dims: as in `bearing_sensor`.
         velocity: as in `range_rate_sensor`.
 
     Deviations: at the sensor itself as `range_sensor`, `bearing_sensor` and `range_rate_sensor`.
     """
-    return _looking(r, position, velocity, 2, (_range, _bearing, _range_rate))
+    parts = (_range, _bearing, _range_rate)
+    return _looking(r, position, velocity, _at_least_two(dims), parts)
 
 
 @from_recipe
-def azimuth_elevation_range_sensor(r: Parameter, position: Place = (0.0, 0.0, 0.0)) -> Sensor:
+def azimuth_elevation_range_sensor(r: Parameter, position: Place = None, dims: int = 3) -> Sensor:
     r"""A sensor of azimuth :math:`\mathrm{atan2}(y, x)`, elevation :math:`\mathrm{atan2}(z,
     \sqrt{x^2 + y^2})` and range, of :math:`p - p_s = (x, y, z)`.
 
     Args:
         r: noise: a variance for all, variances (rad^2, rad^2, m^2), (3, 3), or a function of
             `params`.
-        position: of the sensor, (3,), or a function of (params, t), or of `params`.
+        position: p_s: (3,), or a function of (params, t), or of `params`; None: the origin.
+        dims: number of space dimensions, 3.
 
     Deviations: straight above the sensor the azimuth, and at the sensor itself all three, are
         undefined: 0 with a zero gradient.
     """
+    checks.require(dims == 3, "dims", "3, since an elevation needs space", dims)
     return _looking(r, position, None, 3, (_bearing, _elevation, _range))
+
+
+def _at_least_two(dims: int) -> int:
+    return checks.whole("dims", dims, 2)
 
 
 def _looking(

@@ -269,6 +269,14 @@ REFUSED = {
         lambda: ej.models.range_sensor(1.0, (0.0, 0.0), dims=3),
         "position: expected shape (3,), got shape (2,)",
     ),
+    "an elevation in the plane": (
+        lambda: ej.models.azimuth_elevation_range_sensor(1.0, dims=2),
+        "dims: expected 3, since an elevation needs space, got 2",
+    ),
+    "a bearing on a line": (
+        lambda: ej.models.bearing_sensor(1.0, dims=1),
+        "dims: expected a whole number >= 2, got 1",
+    ),
     "a velocity of another size": (
         lambda: ej.models.range_rate_sensor(1.0, (0.0, 0.0), velocity=(0.0,)),
         "velocity: expected shape (2,), got shape (1,)",
