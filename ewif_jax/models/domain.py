@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.dtypes import canonicalize_dtype
 
 from ewif_jax import checks
 from ewif_jax.models.parameters import resolve
@@ -28,7 +29,7 @@ def scaled(factor: Numbers, matrix: Array) -> Array:
     """factor () times a matrix, also where types may not be promoted silently."""
     if not hasattr(factor, "dtype"):
         return factor * matrix
-    dtype = jnp.promote_types(factor.dtype, matrix.dtype)
+    dtype = canonicalize_dtype(jnp.promote_types(factor.dtype, matrix.dtype))
     return factor.astype(dtype) * matrix.astype(dtype)
 
 

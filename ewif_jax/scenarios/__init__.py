@@ -15,6 +15,7 @@ from ewif_jax.scenarios.arrowhead import (
     arrowhead_state,
 )
 from ewif_jax.scenarios.divergence import divergence, divergence_curve, divergence_filter
+from ewif_jax.scenarios.mixed_fleet import mixed_fleet, mixed_fleet_model
 from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
 from ewif_jax.scenarios.turn import turn, turn_model, turn_state
@@ -34,6 +35,8 @@ __all__ = [
     "divergence",
     "divergence_curve",
     "divergence_filter",
+    "mixed_fleet",
+    "mixed_fleet_model",
     "random_walk",
     "random_walk_model",
     "sine",
