@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from apart import FLAGS_OF_THE_TESTS, soon_fast
 
 import ewif_jax as ej
-from ewif_jax.fast import compiling
+from ewif_jax.fast import cache, compiling
+from ewif_jax.fast.cache import keep_programs
 
 CHILD = """
 import resource
@@ -95,6 +97,101 @@ def test_loops_become_one_function_and_cores_devices_and_no_number_changes(tmp_p
     assert not prepared.pop("waits")
     for name, expected in plain.items():
         np.testing.assert_allclose(prepared[name], expected, rtol=1e-10, atol=1e-12, err_msg=name)
+
+
+KEPT = """
+import sys
+import warnings
+import jax
+import jax.numpy as jnp
+from jax._src import monitoring
+import ewif_jax as ej
+from ewif_jax.fast import cache
+
+ej.prepare_cpu(1, cache={"": True}.get(sys.argv[1], sys.argv[1]))
+read = []
+monitoring.register_event_listener(lambda name, **_: read.append(name))
+model = ej.models.random_walk(sensors=ej.models.position_sensor(1.0), q=0.5)
+prior = ej.Gaussian(jnp.zeros(1), jnp.eye(1))
+rows = ej.stream([1.0, 2.0], [0.5, 0.7])
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    mean = ej.run(ej.kalman(model), None, rows, prior=prior, t0=0.0).mean
+hits = sum(name.endswith("cache_hits") for name in read)
+print(jax.config.jax_compilation_cache_dir, hits, float(mean[-1, 0]), len(told), sep=chr(10))
+"""
+
+
+def kept(folder, home, **environment):
+    """The cache folder, programs read from it, an estimate, and warnings, of a process."""
+    system = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "caches")}
+    without = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", KEPT, str(folder)],
+        env={**without, **system, **environment},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    place, hits, mean, told = done.stdout.split()[-4:]
+    return place, int(hits), float(mean), int(told)
+
+
+def test_programs_are_kept_for_the_next_process(tmp_path):
+    place, none, mean, _ = kept("", tmp_path)
+    folder = tmp_path / "caches" / "ewif_jax"
+    assert Path(place).parent == folder
+    assert none == 0
+    files = program_files(place)
+    _, hits, same, _ = kept("", tmp_path)
+    assert hits > 5
+    assert same == mean
+    assert program_files(place) == files
+    # Other options of the compiler make other programs.
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_enable_fast_min_max=true"
+    assert kept("", tmp_path, XLA_FLAGS=flags)[1] == 0
+    # A file that a process left half written is compiled again, with a warning.
+    for file in program_files(place):
+        file.write_bytes(file.read_bytes()[:100])
+    _, hits, again, told = kept("", tmp_path)
+    assert (hits, again) == (0, mean)
+    assert told > 0
+
+
+def program_files(place):
+    return set(Path(place).glob("*-cache"))
+
+
+def test_the_folder_is_the_users_or_the_one_given_or_the_one_chosen_before(tmp_path, monkeypatch):
+    chosen = {}
+    monkeypatch.setattr(jax.config, "update", chosen.__setitem__)
+    monkeypatch.setattr(cache, "chosen_folder", lambda: None)
+    keep_programs(False)
+    assert not chosen
+    keep_programs(tmp_path / "mine")
+    place = Path(chosen.pop("jax_compilation_cache_dir"))
+    assert place.parent == tmp_path / "mine"
+    monkeypatch.setattr(cache, "CPUINFO", tmp_path / "other")
+    (tmp_path / "other").write_text("flags : of another processor\n")
+    keep_programs(tmp_path / "mine")
+    assert chosen.pop("jax_compilation_cache_dir") != str(place)
+    monkeypatch.setattr(cache, "chosen_folder", lambda: "before")
+    chosen.clear()
+    keep_programs(True)
+    assert not chosen
+
+
+def test_a_folder_that_cannot_be_is_refused_or_done_without(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "chosen_folder", lambda: None)
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(OSError, match="file"):
+        keep_programs(file)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))
+    with pytest.warns(UserWarning, match=r"not kept.*file"):
+        keep_programs(True)
+    with pytest.raises(ValueError, match="cache: expected True, False or a folder"):
+        keep_programs(3)
 
 
 def test_too_late_and_bad_sizes_are_refused():

@@ -14,6 +14,7 @@ from jax.errors import JaxRuntimeError
 from jax.extend.core import get_opaque_trace_state
 
 from ewif_jax import checks
+from ewif_jax.fast.cache import keep_programs
 from ewif_jax.plain import native
 from ewif_jax.types import DTypeLike, Numbers
 
@@ -39,8 +40,10 @@ WHOLE_LOOPS_BELOW = 1_500_000
 whose results are laid out faster by several threads."""
 
 
-def prepare_cpu(devices: int | None = None) -> None:
-    """Makes this process fast at filtering on a CPU. An application's choice, for it to call before
+def prepare_cpu(
+    devices: int | None = None, *, cache: bool | str | os.PathLike[str] = False
+) -> None:
+    r"""Makes this process fast at filtering on a CPU. An application's choice, for it to call before
     anything is computed: importing `ewif_jax` changes no setting.
 
     * Loops over small arrays are compiled as one function each. Otherwise XLA calls one function
@@ -50,14 +53,24 @@ def prepare_cpu(devices: int | None = None) -> None:
     * Every core is a device, over which batches spread their runs.
     * Memory that arrays of up to 1 GiB leave stays with the process (glibc): the system hands out
       new memory page by page, which takes up to half as long as filtering a large batch.
+    * With `cache` programs are kept on disk: the next process reads what this one has compiled.
+      What is kept is found again by the same program, versions of JAX and kind of processor alone.
+      Several processes may share the folder; a file that is not whole costs a warning of JAX and a
+      compilation. Nothing is ever deleted: the folder may be, at any time.
 
     Args:
         devices: how many devices (default: one for each core).
+        cache: True: JAX's cache of compiled programs in the user's cache folder
+            (``~/.cache/ewif_jax``, ``$XDG_CACHE_HOME/ewif_jax``, ``~/Library/Caches/ewif_jax``,
+            ``%LOCALAPPDATA%\\ewif_jax\Cache``); or a folder; False: as JAX is configured. A
+            folder chosen before (``JAX_COMPILATION_CACHE_DIR``) stays.
 
     Raises:
         RuntimeError: JAX has computed something already.
         ValueError: `devices` is not a whole number >= 1.
+        OSError: a `cache` folder given that cannot be written in.
     """
+    keep_programs(cache)
     count = _core_count() if devices is None else checks.whole("devices", devices, 1)
     flags = os.environ.get("XLA_FLAGS", "")
     chosen = _OPTIONS in flags

@@ -18,10 +18,10 @@ STOPPED = 130
 
 
 def main() -> None:
-    """Entry point: `prepare_cpu`, then `run`; a signal ends it with a message."""
+    """Entry point: `prepare_cpu`, programs kept on disk, then `run`; a signal ends it with a message."""
     listen_for_signals()
     try:
-        prepare_cpu()
+        prepare_cpu(cache=True)
         status = run(sys.argv[1:])
     except Stopped as stopped:
         status = _complain_and_end(str(stopped), stopped.status)
