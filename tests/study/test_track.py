@@ -100,6 +100,37 @@ def test_a_filter_without_late_data_says_so(two_tracks, tmp_path, capsys):
     assert "119 used, 1 too late" in capsys.readouterr().out
 
 
+def test_outliers_are_refused_or_weighed_down(tmp_path, capsys):
+    """Two of 60 rows are 500 m off; the rest is as modelled."""
+    rng, time = np.random.default_rng(3), np.arange(60.0)
+    place = 2 * time[:, None] + rng.normal(0, 1.0, (60, 2))
+    place[[25, 40]] += 500
+    frame = pd.DataFrame({"time": time, "x": place[:, 0], "y": place[:, 1]})
+    path = tmp_path / "wild.csv"
+    frame.to_csv(path, index=False)
+    last = {}
+    for kind, extra in {
+        "plain": [],
+        "gate": ["--gate", "0.9999"],
+        "robust": ["--robust", "3"],
+    }.items():
+        out = tmp_path / kind
+        given = ["track", str(path), "--noise", "1", "--estimator", "kalman", "--q", "0.001"]
+        assert run([*given, *extra, "--out", str(out)]) == 0
+        assert ("2 rejected" in capsys.readouterr().out) == (kind == "gate")
+        estimates = pd.read_csv(out / "track" / "estimates.csv")
+        last[kind] = abs(estimates["x"] - 2 * estimates["time"])[40]
+    assert last["plain"] > 50
+    assert max(last["gate"], last["robust"]) < 3
+
+
+@pytest.mark.parametrize("given", [["--gate", "1.5"], ["--gate", "0"], ["--robust", "-1"]])
+def test_what_makes_no_gate_is_refused(two_tracks, capsys, given):
+    with pytest.raises(SystemExit):
+        run(["track", str(two_tracks), *given])
+    assert f"argument {given[0]}: expected a number" in capsys.readouterr().err
+
+
 def test_it_is_the_plain_filter(two_tracks, tmp_path):
     """Without late rows the prediction errors are those of a plain NumPy loop."""
     frame = pd.read_csv(two_tracks).query("track == 'b'")

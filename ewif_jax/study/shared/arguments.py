@@ -103,6 +103,19 @@ def _track_options(parser: argparse.ArgumentParser) -> None:
         default=4,
         help="past times al1, or measurements asd, keeps (4)",
     )
+    method.add_argument(
+        "--gate",
+        type=probability_argument,
+        metavar="P",
+        help="refuse what is outside of a chi-square gate of this probability (0.999), until five "
+        "in a row were",
+    )
+    method.add_argument(
+        "--robust",
+        type=positive,
+        metavar="C",
+        help="weigh down what is more than about C (2 to 5) noise standard deviations off",
+    )
     tuning = parser.add_argument_group("tuning")
     tuning.add_argument("--tune", action="store_true", help="tau, q or fading, by gradient")
     tuning.add_argument(
@@ -148,6 +161,14 @@ def above_argument(bound: float) -> Callable[[str], float]:
 
 
 positive = above_argument(0)
+
+
+def probability_argument(text: str) -> float:
+    """Reads a number above 0 and below 1."""
+    value = positive(text)
+    if value >= 1:
+        raise argparse.ArgumentTypeError(f"expected a number below 1, got {text!r}")
+    return value
 
 
 def seed_argument(text: str) -> int:

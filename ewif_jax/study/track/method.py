@@ -10,8 +10,10 @@ import numpy as np
 from ewif_jax import models
 from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.fading import fading
+from ewif_jax.estimators.gated import gated
 from ewif_jax.estimators.information import information
 from ewif_jax.estimators.kalman import kalman
+from ewif_jax.estimators.robust import robust
 from ewif_jax.estimators.square_root import square_root
 from ewif_jax.oosm.al1 import al1
 from ewif_jax.oosm.asd import asd
@@ -76,6 +78,10 @@ def track_method(arguments: argparse.Namespace, tracks: Tracks) -> TrackMethod:
     sensors = [models.position_sensor(s**2, dims) for s in noise]
     model = MODELS[arguments.model](sensors=sensors, q=lambda p: p["q"], dims=dims)
     estimator = BUILDERS[arguments.estimator](model, arguments.lag)
+    if arguments.robust is not None:
+        estimator = robust(estimator, arguments.robust)
+    if arguments.gate is not None:
+        estimator = gated(estimator, arguments.gate)
     prior = None
     if arguments.estimator not in ("ewif", "information"):
         spread = UNKNOWN * max(noise) / interval ** np.arange(order + 1)
