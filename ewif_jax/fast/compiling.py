@@ -43,8 +43,8 @@ whose results are laid out faster by several threads."""
 def prepare_cpu(
     devices: int | None = None, *, cache: bool | str | os.PathLike[str] = False
 ) -> None:
-    r"""Makes this process fast at filtering on a CPU. An application's choice, for it to call before
-    anything is computed: importing `ewif_jax` changes no setting.
+    r"""Makes this process fast at filtering on a CPU: an application's choice, for it to call
+    before anything is computed. Importing `ewif_jax` changes no setting.
 
     * Loops over small arrays are compiled as one function each. Otherwise XLA calls one function
       for every operation, which takes longer than the operation where a single series or up to a

@@ -81,7 +81,7 @@ def mixed_fleet(outliers: float = 0.05, latency: float = CAMERA_LATENCY) -> Scen
         value = jnp.where(has, exact + error, 0)
         stamps = time + jnp.where(sensor == CAMERA, latency, 0.0)
         order = jnp.argsort(arrival, stable=True)
-        stream = Measurement(stamps, value, jnp.asarray(sensor), jnp.asarray(has))
+        stream = Measurement(jnp.asarray(stamps), value, jnp.asarray(sensor), jnp.asarray(has))
         stream, shown, arrival = jax.tree.map(lambda x: x[order], (stream, shown, arrival))
         return Simulation(stream, shown, arrival)
 

@@ -18,7 +18,7 @@ STOPPED = 130
 
 
 def main() -> None:
-    """Entry point: `prepare_cpu`, programs kept on disk, then `run`; a signal ends it with a message."""
+    """Entry point: `prepare_cpu`, keeping programs, then `run`; a signal ends it with a message."""
     listen_for_signals()
     try:
         prepare_cpu(cache=True)
