@@ -11,6 +11,7 @@ from ewif_jax import checks
 from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.trees import choose
 from ewif_jax.models import Model, resolve
+from ewif_jax.models.angles import Angles
 from ewif_jax.recipe import from_recipe
 from ewif_jax.recursions.contract import Recursion, estimator_from
 from ewif_jax.recursions.mixtures import (
@@ -25,6 +26,7 @@ from ewif_jax.recursions.modes import (
     check_members,
     check_probabilities,
     joint_model,
+    mixed_angles,
 )
 from ewif_jax.types import (
     Estimator,
@@ -84,6 +86,8 @@ def imm(
         dt: seconds of one step, a number > 0.
         max_steps: how many steps may be asked for at once.
 
+    Angles of the state (`Model.state_angle` of models that are not linear) are mixed on the circle.
+
     `Info` is the mixture's: innovation and its covariance are its moments before the update, the
     log likelihood is the logarithm above. A model in which a measurement is impossible, or not a
     number, gets probability 0; if that is so in all, the probabilities stay. A late measurement is
@@ -126,6 +130,7 @@ def imm(
     if probabilities is not None and not callable(probabilities):
         check_probabilities(probabilities, count)
     model = joint_model(estimators, chain, count)
+    angle = None if model is None else mixed_angles(estimators)
 
     def start(params: Params, prior: Gaussian, t0: Array, key: RandomKey) -> ModesState:
         del key
@@ -140,7 +145,7 @@ def imm(
     def move(params: Params, state: ModesState, time: Array) -> ModesState:
         end = jnp.maximum(time, state.time)
         chances = jnp.asarray(chain.chances(params, state.time, end), state.time.dtype)
-        met = _mixed_members(estimators, params, state, chances)
+        met = _mixed_members(estimators, params, state, chances, angle)
         met = choose(time > state.time, met, state)
         pairs = zip(estimators, met.members, strict=True)
         members = tuple(e.predict(params, own, time) for e, own in pairs)
@@ -167,21 +172,25 @@ def imm(
     def estimate(params: Params, state: ModesState) -> Gaussian:
         shares = jnp.exp(state.log_probabilities)
         found = _estimates(estimators, params, state)
-        return Gaussian(*mixed_moments(shares, jnp.ones(count, bool), *found))
+        return Gaussian(*mixed_moments(shares, jnp.ones(count, bool), *found, angle))
 
     recursion = Recursion("imm", start, move, measure, estimate, model=model)
     return estimator_from(recursion._replace(moves_back=True))
 
 
 def _mixed_members(
-    estimators: Sequence[Estimator], params: Params, state: ModesState, chances: Array
+    estimators: Sequence[Estimator],
+    params: Params,
+    state: ModesState,
+    chances: Array,
+    angle: Angles,
 ) -> ModesState:
     """The state after models have changed with `chances` (M, M), before its members move."""
     log_weights, shares = passed_on(state.log_probabilities, chances)
     means, covs = _estimates(estimators, params, state)
     every, members = jnp.ones(len(estimators), bool), []
     for j, (estimator, own) in enumerate(zip(estimators, state.members, strict=True)):
-        moments = Gaussian(*mixed_moments(shares[:, j], every, means, covs))
+        moments = Gaussian(*mixed_moments(shares[:, j], every, means, covs, angle))
         # To a model that nothing goes to there are no moments; it stays as it is.
         known = jnp.isfinite(log_weights[j])
         safe = choose(known, moments, Gaussian(means[j], covs[j]))

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ewif_jax.models.angles import Angles, centre_of, wrapped_state
+
 FARTHEST = 80.0
 """What a logarithm may be above the one that counts: its exponential is still a number."""
 
@@ -49,13 +51,21 @@ def passed_on(log_weights: Array, chances: Array) -> tuple[Array, Array]:
 
 
 def mixed_moments(
-    weights: Array, is_awake: Array, means: Array, covs: Array
+    weights: Array, is_awake: Array, means: Array, covs: Array, angle: Angles = None
 ) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of a mixture of those members that know the state."""
+    """Mean (n,) and covariance (n, n) of a mixture of those members that know the state; `angle`
+    says which components are mixed on the circle."""
     means = jnp.where(is_awake[:, None], means, 0)
     covs = jnp.where(is_awake[:, None, None], covs, 0)
-    mean = jnp.sum(weights[:, None] * means, 0)
-    apart = jnp.where(is_awake[:, None], means - mean[None], 0)
+    if angle is None:
+        mean = jnp.sum(weights[:, None] * means, 0)
+        apart = means - mean[None]
+    else:
+        centre = centre_of(angle, means.T, weights)
+        around = wrapped_state(angle, (means - centre[None]).T).T
+        shift = jnp.sum(weights[:, None] * around, 0)
+        mean, apart = centre + shift, around - shift[None]
+    apart = jnp.where(is_awake[:, None], apart, 0)
     # The law of total covariance: means that disagree are uncertainty too.
     spread = covs + apart[:, :, None] * apart[:, None, :]
     return mean, jnp.sum(weights[:, None, None] * spread, 0)

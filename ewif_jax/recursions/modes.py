@@ -11,6 +11,7 @@ from jax import Array
 
 from ewif_jax import checks
 from ewif_jax.models import Model
+from ewif_jax.models.angles import Angles
 from ewif_jax.models.discrete import is_discrete, motion
 from ewif_jax.models.domain import check_covariances
 from ewif_jax.models.parameters import named
@@ -130,6 +131,20 @@ def joint_model(estimators: Sequence[Estimator], chain: Chain, count: int) -> Mo
         sensors=min(sensors, default=None),
         check=check,
     )
+
+
+def mixed_angles(estimators: Sequence[Estimator]) -> Angles:
+    """Which components of the state are angles in all models; None if none is, or a linear model
+    lets them turn on."""
+    models = [estimator.model for estimator in estimators]
+    if any(model is None or model.linear is not None for model in models):
+        return None
+    said = {model.state_angle for model in models if model is not None}
+    checks.require(
+        len(said) == 1, "estimators", "models with one state_angle", sorted(map(str, said))
+    )
+    (angle,) = said
+    return angle if angle is not None and any(angle) else None
 
 
 def _asked_chances(

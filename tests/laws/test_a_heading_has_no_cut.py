@@ -22,6 +22,11 @@ def turning(params, x, t0, t1):
     return jnp.stack([wrap_angle(x[0] + dt * jnp.sin(x[1])), x[1]])
 
 
+def change(params, t0, t1):
+    kept = jnp.exp(-(t1 - t0) * jnp.array([0.1, 0.2]))
+    return jnp.stack([jnp.stack([kept[0], 1 - kept[0]]), jnp.stack([1 - kept[1], kept[1]])])
+
+
 def noise(params, t0, t1):
     dt = t1 - t0
     return params["q"] * jnp.asarray([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
@@ -63,13 +68,14 @@ METHODS = {
     "enkf2": lambda model: ej.enkf2(model, 12, 4),
     "bootstrap": lambda model: ej.bootstrap(model, 30),
     "guided": lambda model: ej.guided(model, 30),
+    "imm": lambda model: ej.imm([ej.extended(model), ej.unscented(model)], change),
     "ewif, sigma points": lambda model: ej.ewif(model, 2.0, linearisation="sigma-points"),
     "pf_retrodict": lambda model: ej.pf_retrodict(model, 30),
     "pf_extended": lambda model: ej.pf_extended(model, 30, 4),
     "pf_fixed_point, eks": lambda model: ej.pf_fixed_point(model, 30, 4, "eks"),
     "pf_fixed_point, ps": lambda model: ej.pf_fixed_point(model, 30, 4, "ps"),
 }
-QUICK = ("unscented", "al1", "ensemble", "enkf1", "bootstrap", "pf_extended")
+QUICK = ("unscented", "imm", "al1", "ensemble", "enkf1", "bootstrap", "pf_extended")
 """The others with --all."""
 
 
