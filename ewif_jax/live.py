@@ -122,29 +122,59 @@ def step_batch(
     )
 
 
-def forecast(estimator: Estimator, params: Params, state: State, times: Numbers) -> Gaussian:
-    """What a filter expects at `times`: means (T, n) and covariances (T, n, n).
+def forecast(
+    estimator: Estimator,
+    params: Params,
+    state: State,
+    times: Numbers,
+    params_per_run: PyTree = False,
+) -> Gaussian:
+    """What a filter expects at `times`: means (T, n) and covariances (T, n, n); of R tracks at once
+    means (R, T, n) and covariances (R, T, n, n).
 
-    Each time is predicted straight from the state, which stays as it is. Estimators that do not
-    move back are NaN at a time before the state's.
+    Each time is predicted straight from the state, which stays as it is: also the estimate at *now*
+    while nothing arrives. Estimators that do not move back are NaN at a time before the state's.
 
     Args:
         estimator: any `Estimator`.
-        params: what its parameters are read from.
-        state: from `estimator.init`, `step`, or the `final_state` of `run`.
-        times: (T,) in seconds, in any order.
+        params: what its parameters are read from; leaves marked in `params_per_run` lead with R.
+        state: from `estimator.init`, `step`, or the `final_state` of `run`; or the states of R
+            tracks, every leaf (R, ...), of `step_batch` or `run_batch`.
+        times: (T,) in seconds, in any order; or (R, T), each track's own.
+        params_per_run: True, False, or a pytree prefix of `params` of these.
 
     Raises:
-        ValueError: times that are not one axis of finite numbers; known times between two steps
-            of a discrete model.
+        ValueError: times of another shape, or not finite; arguments whose numbers of tracks differ;
+            known times between two steps of a discrete model.
     """
     checks.estimator(estimator)
-    checks.shape("times", times, ("T",))
+    many = np.ndim(state.time) == 1
+    own_times = many and np.ndim(times) == 2
+    checks.shape("times", times, ("R", "T") if own_times else ("T",))
     checks.finite("times", times)
-    dtype = state.time.dtype
-    model = estimator.model
-    check_steps(None if model is None else model.steps, times, state.time, dtype, "times", False)
-    return _forecast(estimator, params, state, jnp.asarray(times, dtype))
+    dtype, model = state.time.dtype, estimator.model
+    steps = None if model is None else model.steps
+    if not many:
+        check_steps(steps, times, state.time, dtype, "times", False)
+        return _forecast(estimator, params, state, jnp.asarray(times, dtype))
+    runs = np.shape(state.time)[0]
+    flags = per_run_flags("params", params_per_run, params)
+    same_runs("params", params, flags, runs)
+    same_runs("state", state, jax.tree.map(lambda _: True, state), runs)
+    same_runs("times", times, own_times, runs)
+    start = checks.concrete_value(state.time)
+    if start is not None and checks.concrete_value(times) is not None:
+        check_steps(
+            steps,
+            np.broadcast_to(times, (runs, np.shape(times)[-1])),
+            start[:, None],
+            dtype,
+            "times",
+            False,
+        )
+    return _forecast_tracks(
+        estimator, params, state, jnp.asarray(times, dtype), Frozen((flags, own_times))
+    )
 
 
 def arrivals(measurements: Measurement) -> Iterator[Measurement]:
@@ -217,6 +247,19 @@ def _forecasts_at(estimator: Estimator, params: Params, state: State, times: Arr
     return jax.vmap(predicted)(times)
 
 
+def _forecasts_of_tracks(
+    estimator: Estimator, params: Params, states: State, times: Array, flags: Frozen
+) -> Gaussian:
+    params_f, own_times = flags.tree
+    axes = jax.tree.map(lambda f: 0 if f else None, (params_f, own_times))
+
+    def of_track(params: Params, state: State, times: Array) -> Gaussian:
+        return _forecasts_at(estimator, params, state, times)
+
+    return jax.vmap(of_track, in_axes=(axes[0], 0, axes[1]))(params, states, times)
+
+
+_forecast_tracks = quick_jit(_forecasts_of_tracks, ("estimator", "flags"), WIDE)
 _forecast = quick_jit(_forecasts_at, ("estimator",), QUICKEST)
 _step = quick_jit(_stepped_runs, ("estimator",), QUICKEST)
 

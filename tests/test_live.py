@@ -154,15 +154,46 @@ def test_a_forecast_is_the_motion_from_the_state(name):
         agree(found.cov[k], F @ cov @ F.T * grown + (0 if name == "ewif" else Q))
 
 
+@pytest.mark.parametrize("name", ["al1", "replay"])
+def test_forecasts_of_many_tracks_are_those_of_each(name):
+    """From states that differ, at common times or their own, with parameters of their own."""
+    est, params = METHODS[name], {**PARAMS, "q": np.linspace(0.1, 0.5, TRACKS)}
+    flags = {**dict.fromkeys(PARAMS, False), "q": True}
+    states = ej.run_batch(
+        est, params, TRACKS_AT_ONCE, prior=PRIOR, t0=0.0, params_per_run=flags
+    ).final_state
+    own = np.asarray(states.time)[:, None] + np.array([0.0, 2.0])
+    for times in (np.array([8.0, 7.0, 20.0]), own):
+        found = ej.forecast(est, params, states, times, params_per_run=flags)
+        assert found.mean.shape == (TRACKS, times.shape[-1], 4)
+        for k in range(TRACKS):
+            state, at = (
+                jax.tree.map(lambda x, k=k: x[k], states),
+                times[k] if times.ndim == 2 else times,
+            )
+            wanted = ej.forecast(est, {**params, "q": params["q"][k]}, state, at)
+            agree(jax.tree.map(lambda x, k=k: x[k], found), wanted)
+    with pytest.raises(ValueError, match="times: expected 5 runs"):
+        ej.forecast(est, params, states, own[:3], params_per_run=flags)
+    with pytest.raises(ValueError, match=r"params\['q'\]: expected 5 runs"):
+        ej.forecast(est, {**params, "q": params["q"][:2]}, states, own, params_per_run=flags)
+
+
 def test_a_forecast_refuses_what_is_no_time():
     state = METHODS["kalman"].init(PARAMS, PRIOR, 0.0)
     for times in (np.array(1.0), np.array([1.0, np.nan])):
         with pytest.raises(ValueError, match="times: expected"):
             ej.forecast(METHODS["kalman"], PARAMS, state, times)
     textbook = ej.kalman(ej.linear_model(np.eye(1), np.eye(1), np.eye(1), np.eye(1)))
-    state = textbook.init(None, ej.Gaussian(np.zeros(1), np.eye(1)), 0.0)
+    prior_of_one = ej.Gaussian(np.zeros(1), np.eye(1))
+    state = textbook.init(None, prior_of_one, 0.0)
     with pytest.raises(ValueError, match=r"times: expected whole steps"):
         ej.forecast(textbook, None, state, np.array([1.0, 2.5]))
+    tracks = jax.vmap(lambda t0: textbook.init(None, prior_of_one, t0))(np.array([0.0, 0.25]))
+    both = np.array([[1.0, 3.0], [2.25, 1.25]])
+    np.testing.assert_allclose(ej.forecast(textbook, None, tracks, both).cov[:, :, 0, 0] % 1, 0)
+    with pytest.raises(ValueError, match=r"times: expected whole steps"):
+        ej.forecast(textbook, None, tracks, np.array([1.0, 3.0]))
 
 
 def test_tracks_of_a_discrete_model_count_their_own_steps():
