@@ -113,13 +113,13 @@ def _checked_latency(latency: Numbers, sensor: Numbers) -> Any:
 
 def _shifted(measurements: Measurement, latency: Numbers) -> Measurement:
     time, sensor = measurements.time, measurements.sensor
-    known = [checks.concrete_value(x) for x in (time, sensor, latency)]
-    if any(x is None for x in known):
+    at_hand = [checks.concrete_value(x) for x in (time, sensor, latency)]
+    if any(x is None for x in at_hand):
         xp, dtype = jnp, float_dtype(measurements.value)
         time, latency = jnp.asarray(time, dtype), jnp.asarray(latency, dtype)
     else:
         # In float64, as times are given: the filter's dtype rounds once, the difference.
-        xp, (time, sensor, latency) = np, known
+        xp, (time, sensor, latency) = np, at_hand
         time = np.asarray(time, float)
     shift = latency if np.ndim(latency) == 0 else latency[sensor]
     shape = np.broadcast_shapes(np.shape(time), np.shape(shift))
@@ -129,11 +129,11 @@ def _shifted(measurements: Measurement, latency: Numbers) -> Measurement:
 
 def _check_whole_steps(steps: Steps, latency: Parameter) -> None:
     """A discrete model knows no time between two steps, so its latencies are known whole steps."""
-    known = None if callable(latency) else checks.concrete_value(latency)
+    constant = None if callable(latency) else checks.concrete_value(latency)
     expected = f"known whole steps of dt = {steps.dt:g} s, since the model is discrete"
     remedy = "; models.from_continuous makes one that is not"
-    got = "a parameter" if known is None else checks.Shown(latency)
-    whole = known is not None and _all_whole(known / steps.dt)
+    got = "a parameter" if constant is None else checks.Shown(latency)
+    whole = constant is not None and _all_whole(constant / steps.dt)
     checks.require(whole, "latency", expected + remedy, got)
 
 

@@ -23,6 +23,7 @@ from ewif_jax.batch import Observer, Step, run_batch
 from ewif_jax.fast.compiling import array
 from ewif_jax.kernels import gaussian
 from ewif_jax.kernels.forecasts import gaussian_crps, gaussian_energy
+from ewif_jax.recursions.contract import is_used
 from ewif_jax.streams import checked_stream, float_dtype, present_values
 from ewif_jax.types import Estimator, Measurement, Numbers, Params, Status
 
@@ -264,10 +265,6 @@ def score_of(name: str, score: Score, step: Step, truth: Array, mask: Array) -> 
     return jnp.asarray(found)
 
 
-def _is_used(step: Step) -> Array:
-    return (step.info.status == Status.USED) | (step.info.status == Status.LATE_USED)
-
-
 def _where_used(step: Step, score: Array) -> Array:
     """`score` of a measurement that was used and predicted, otherwise NaN; infinite where
     variances or densities are none."""
@@ -276,7 +273,7 @@ def _where_used(step: Step, score: Array) -> Array:
     kept = jnp.where(jnp.isnan(score), jnp.inf, score)
     # What is not predicted has log likelihood 0 if nothing is known; else it is -inf or NaN.
     silent = jnp.where(jnp.isfinite(log_likelihood), _silent_or_broken(step), jnp.inf)
-    return jnp.where(_is_used(step), jnp.where(said, kept, silent), _silent_or_broken(step))
+    return jnp.where(is_used(step.info), jnp.where(said, kept, silent), _silent_or_broken(step))
 
 
 def _silent_or_broken(step: Step) -> Array:
@@ -294,5 +291,5 @@ def _silent_or_broken(step: Step) -> Array:
 def _squared_length(step: Step) -> Array:
     """The squared length of the innovation; 0 where it is not a number."""
     innovation = step.info.innovation
-    is_defined = _is_used(step) & jnp.all(jnp.isfinite(innovation))
+    is_defined = is_used(step.info) & jnp.all(jnp.isfinite(innovation))
     return jnp.sum(jnp.square(jnp.where(is_defined, innovation, 0)))

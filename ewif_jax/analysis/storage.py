@@ -42,8 +42,7 @@ def storage(
     Raises:
         ValueError: n < 1; what is not an `Estimator`.
     """
-    kind = type(estimator).__name__
-    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    checks.estimator(estimator)
     n = checks.whole("n", n, 1)
     prior = Gaussian(jnp.zeros(n), jnp.eye(n))
     key = jax.random.key(0) if key is None else key

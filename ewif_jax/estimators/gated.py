@@ -81,8 +81,7 @@ def gated(
     Raises:
         ValueError: `probability` is not in (0, 1]; recover_after < 1.
     """
-    kind = type(estimator).__name__
-    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    checks.estimator(estimator)
     if not callable(probability):
         _check_probability(probability)
     patience = None if recover_after is None else checks.whole("recover_after", recover_after, 1)

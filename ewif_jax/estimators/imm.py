@@ -192,11 +192,11 @@ def _mixed_members(
     for j, (estimator, own) in enumerate(zip(estimators, state.members, strict=True)):
         moments = Gaussian(*mixed_moments(shares[:, j], every, means, covs, angle))
         # To a model that nothing goes to there are no moments; it stays as it is.
-        known = jnp.isfinite(log_weights[j])
-        safe = choose(known, moments, Gaussian(means[j], covs[j]))
+        is_reached = jnp.isfinite(log_weights[j])
+        safe = choose(is_reached, moments, Gaussian(means[j], covs[j]))
         # As part of a program: moments made by mixing are no prior of a user's, to be looked at.
         enter = jax.jit(estimator.init, inline=True)
-        members.append(choose(known, enter(params, safe, state.time), own))
+        members.append(choose(is_reached, enter(params, safe, state.time), own))
     return ModesState(state.time, tuple(members), log_weights)
 
 

@@ -85,8 +85,7 @@ def robust(estimator: Estimator, c: Parameter, kind: Kind = "weight") -> Estimat
         ValueError: c <= 0; an unknown kind; an estimator that is not made of a Model; at `init`,
             one that keeps measurements and uses them anew (`limited_memory`, `pf_fixed_point`).
     """
-    made = isinstance(estimator, Estimator)
-    checks.require(made, "estimator", "an Estimator", type(estimator).__name__)
+    checks.estimator(estimator)
     checks.require(kind in KINDS, "kind", f"one of {', '.join(KINDS)}", repr(kind))
     if not callable(c):
         checks.positive_number("c", c)

@@ -119,8 +119,8 @@ def update(
 def _is_noise(R: Array) -> bool:
     """Whether every component is known, while tracing, to be measured with noise. Nothing has to be
     compared with the rounding of an exact measurement then, which is a tenth of a batch's time."""
-    known = checks.concrete_value(R)
-    return known is not None and bool((np.diagonal(known) > 0).all())
+    noise = checks.concrete_value(R)
+    return noise is not None and bool((np.diagonal(noise) > 0).all())
 
 
 def rounding_of(predicted: Array) -> Array:

@@ -95,8 +95,8 @@ def bank(sensors: Sensor | Sequence[Sensor]) -> Bank:
 def _latency_of(group: Sequence[Sensor]) -> Parameter:
     latencies = [s.latency for s in group]
     if not any(map(callable, latencies)):
-        known = np.asarray(latencies, float)
-        return known if known.any() else None
+        constants = np.asarray(latencies, float)
+        return constants if constants.any() else None
 
     def latency(params: Params) -> Array:
         return jnp.stack([jnp.asarray(resolve(x, params)) for x in latencies])

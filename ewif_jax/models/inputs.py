@@ -32,12 +32,12 @@ class Inputs:
 
 class Pieces(NamedTuple):
     """An interval cut where the input changes: start (P,), end (P,), value (P, k); pieces of no
-    length where there are fewer. known (): whether the input is, over all of the interval."""
+    length where there are fewer. is_given (): whether the input is, over all of the interval."""
 
     start: Array
     end: Array
     value: Array
-    known: Array
+    is_given: Array
 
 
 def inputs(
@@ -95,9 +95,9 @@ def pieces_of(given: Inputs, t0: Array, t1: Array, dtype: DTypeLike) -> Pieces:
     # The first value holds before its time too, the last has no end.
     starts = jnp.concatenate([jnp.full(1, -jnp.inf, dtype), times[1:]])
     ends = jnp.concatenate([times[1:], jnp.full(1, jnp.inf, dtype)])
-    known = jnp.asarray(True)
+    is_given = jnp.asarray(True)
     if given.outside == "nan":
-        known = (t0 >= times[0]) & (t1 <= times[-1])
+        is_given = (t0 >= times[0]) & (t1 <= times[-1])
     count = times.shape[0]
     if given.most is not None and given.most < count:
         first = jnp.sum(ends <= t0)
@@ -105,9 +105,9 @@ def pieces_of(given: Inputs, t0: Array, t1: Array, dtype: DTypeLike) -> Pieces:
         starts, ends, values = (
             lax.dynamic_slice_in_dim(x, first, given.most) for x in (starts, ends, values)
         )
-        known &= t1 <= ends[-1]
+        is_given &= t1 <= ends[-1]
     start, end = (_inside(x, t0, t1) for x in (starts, ends))
-    return Pieces(start, end, values, known | (t1 == t0))
+    return Pieces(start, end, values, is_given | (t1 == t0))
 
 
 def _inside(times: Array, t0: Array, t1: Array) -> Array:
@@ -133,7 +133,7 @@ def driven(F: OfInterval, B: OfInterval, u: Parameter, b: OfInterval | None) -> 
         given = resolve(u, params)
         need_inputs(given)
         dtype = jnp.result_type(t0, t1, 0.0)
-        start, end, value, known = pieces_of(given, t0, t1, dtype)
+        start, end, value, is_given = pieces_of(given, t0, t1, dtype)
 
         def pushed(start: Array, end: Array, value: Array) -> Array:
             response = jnp.asarray(B(params, start, end))
@@ -142,7 +142,7 @@ def driven(F: OfInterval, B: OfInterval, u: Parameter, b: OfInterval | None) -> 
             return matvec(rest, matvec(response, value.astype(response.dtype)))
 
         total = jnp.sum(jax.vmap(pushed)(start, end, value), 0)
-        total = jnp.where(known, total, jnp.nan)
+        total = jnp.where(is_given, total, jnp.nan)
         return total if b is None else total + jnp.asarray(b(params, t0, t1), total.dtype)
 
     return gathered

@@ -23,8 +23,7 @@ def drop_late(estimator: Estimator) -> Estimator:
     Raises:
         ValueError: `estimator` is not an `Estimator`.
     """
-    kind = type(estimator).__name__
-    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    checks.estimator(estimator)
 
     init, predict, take, estimate = estimator[:4]
 

@@ -63,8 +63,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
     Raises:
         ValueError: lag < 1; a measurement of more than `width` components.
     """
-    kind = type(estimator).__name__
-    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    checks.estimator(estimator)
     lag = checks.whole("lag", lag, 1)
     width = checks.whole("width", width, 1)
 

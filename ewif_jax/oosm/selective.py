@@ -65,8 +65,7 @@ def selective(estimator: Estimator, max_delay: Parameter, softness: Parameter = 
         ValueError: max_delay < 0; softness <= 0; `update` of a soft gate on a state of another kind
             than these.
     """
-    kind = type(estimator).__name__
-    checks.require(isinstance(estimator, Estimator), "estimator", "an Estimator", kind)
+    checks.estimator(estimator)
     if not callable(max_delay):
         checks.at_least("max_delay", max_delay, 0.0)
     if softness is not None and not callable(softness):

@@ -32,11 +32,11 @@ from ewif_jax.types import Gaussian, Info, Measurement, Params, RandomKey
 
 
 class DirectionalState(NamedTuple):
-    """time (), known: what is known; ages: the upper triangle of A (n, n), of which v'A v is for
-    how many seconds the direction v (n,) of unit length has not been forgotten."""
+    """time (), information: what is known; ages: the upper triangle of A (n, n), of which v'A v
+    is for how many seconds the direction v (n,) of unit length has not been forgotten."""
 
     time: Array
-    known: InformationState
+    information: InformationState
     ages: Array
 
 
@@ -54,33 +54,35 @@ def directional(
     def start(
         params: Params, prior: Gaussian | None, t0: Array, key: RandomKey
     ) -> DirectionalState:
-        known = plain.init(params, prior, t0, key)
-        n = known.mean.shape[0]
-        return DirectionalState(known.time, known, jnp.zeros(n * (n + 1) // 2, known.mean.dtype))
+        information = plain.init(params, prior, t0, key)
+        n = information.mean.shape[0]
+        return DirectionalState(
+            information.time, information, jnp.zeros(n * (n + 1) // 2, information.mean.dtype)
+        )
 
     def move(params: Params, state: DirectionalState, time: Array) -> DirectionalState:
-        known = lines.transport(params, state.known, time, None)
-        eye = symmetric.pack(jnp.eye(known.mean.shape[0], dtype=known.mean.dtype))
-        return DirectionalState(time, known, state.ages + eye * (time - state.time))
+        information = lines.transport(params, state.information, time, None)
+        eye = symmetric.pack(jnp.eye(information.mean.shape[0], dtype=information.mean.dtype))
+        return DirectionalState(time, information, state.ages + eye * (time - state.time))
 
     def measure(
         params: Params, state: DirectionalState, measurement: Measurement
     ) -> tuple[DirectionalState, Info]:
         growth = growing(params, measurement.time, state.time)
-        seen = lines.look(params, state.known, measurement, growth).seen
+        seen = lines.look(params, state.information, measurement, growth).seen
         # A late measurement is added and forgets nothing: what came since has done so.
         fresh = measurement.time >= state.time
-        known, ages = forgotten(state, jnp.where(fresh, seen, 0), decay(params, state.time))
-        found = lines.look(params, known, measurement, growth)
-        known, info = absorb_sight(known, found, measurement, growth)
-        return DirectionalState(state.time, known, ages), info
+        information, ages = forgotten(state, jnp.where(fresh, seen, 0), decay(params, state.time))
+        found = lines.look(params, information, measurement, growth)
+        information, info = absorb_sight(information, found, measurement, growth)
+        return DirectionalState(state.time, information, ages), info
 
     def estimate(params: Params, state: DirectionalState) -> Gaussian:
-        return plain.estimate(params, state.known)
+        return plain.estimate(params, state.information)
 
     def reach(params: Params, state: DirectionalState, time: Array) -> Array:
         assert plain.reach is not None
-        return plain.reach(params, state.known, time)
+        return plain.reach(params, state.information, time)
 
     made = Recursion(plain.name, start, move, measure, estimate, reach, model=plain.model)
     return made._replace(moves_back=True, starts_from_nothing=True, inverts_prior=True)
@@ -89,21 +91,21 @@ def directional(
 def forgotten(state: DirectionalState, seen: Array, tau: Array) -> tuple[InformationState, Array]:
     """What is known, and the ages, once the directions of the rows of `seen` (m, n) have forgotten
     over theirs; rows of zeros, or that are no numbers, are no directions."""
-    known, A = state.known, symmetric.unpack(state.ages)
+    information, A = state.information, symmetric.unpack(state.ages)
     V = _basis(jnp.where(jnp.all(jnp.isfinite(seen)), seen, 0))
     across = matmul(V, A)
     age = cholesky.factor(matmul(across, V.T))
     growth = _root_of_growth(jnp.square(jnp.diagonal(age.lower)), tau)
     # V I V' = W W'. Of which nothing is known, there is nothing to forget.
-    some = known.variances > 0
-    roots = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, known.variances, 1)), 0)
-    told = cholesky.factor(_product(matmul(V, equations.upper(known.rows).T) * roots[None]))
+    some = information.variances > 0
+    roots = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, information.variances, 1)), 0)
+    told = cholesky.factor(_product(matmul(V, equations.upper(information.rows).T) * roots[None]))
     noise = cholesky.forward(told, growth[:, None] * V).T
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
-    left = moved(known, eye, eye, noise)
+    left = moved(information, eye, eye, noise)
     taken = cholesky.forward(age, across)
     ages = symmetric.pack(A - matmul(taken.T, taken))
-    return choose(jnp.any(noise != 0), left, known), ages
+    return choose(jnp.any(noise != 0), left, information), ages
 
 
 def _basis(rows: Array) -> Array:

@@ -42,8 +42,8 @@ class Chain(NamedTuple):
 def chain_of(transition: Parameter, count: int, dt: float, max_steps: int) -> Chain:
     """The chain of a function (params, t0, t1), or of one step of `dt` seconds: (M, M), or a
     function of `params` alone."""
-    known = checks.concrete_value(dt) is not None
-    checks.require(known, "dt", "a number, not a parameter", "a tracer")
+    is_number = checks.concrete_value(dt) is not None
+    checks.require(is_number, "dt", "a number, not a parameter", "a tracer")
     steps = Steps(float(checks.positive_number("dt", dt)), checks.whole("max_steps", max_steps, 1))
     if not is_discrete(transition):
         return Chain(partial(_asked_chances, named(transition), count), None)
@@ -117,11 +117,13 @@ def joint_model(estimators: Sequence[Estimator], chain: Chain, count: int) -> Mo
         len(steps) < 2, "dt", "one step for all models and the transition", sorted(steps)
     )
     sensors = [model.sensors for model in models if model.sensors is not None]
-    made = [model.check or check_covariances(model.process_cov, model.measurement_cov)
-            for model in models]  # fmt: skip
+    every_check = [
+        model.check or check_covariances(model.process_cov, model.measurement_cov)
+        for model in models
+    ]
 
     def check(params: Params, t0: Numbers, t1: Numbers, seen: Numbers) -> None:
-        for own in made:
+        for own in every_check:
             own(params, t0, t1, seen)
         end = t1 if chain.steps is None else t0 + chain.steps.dt
         check_chances(chain.chances(params, t0, end), count)
