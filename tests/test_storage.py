@@ -55,7 +55,7 @@ def test_bytes_count_flags_too_and_parameters_are_passed_on():
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="estimator: expected an Estimator .*, got a Model"):
+    with pytest.raises(ValueError, match=r"estimator: expected an Estimator .*, got a Model"):
         storage(MODEL, N)
     with pytest.raises(ValueError, match="n: expected a whole number >= 1"):
         storage(ej.extended(MODEL), np.float64(4.0))

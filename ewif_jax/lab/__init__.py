@@ -3,9 +3,10 @@
 `compare` runs methods on the same simulated runs over a grid of parameters and gives a `Comparison`
 with tables, labelled arrays, figures and a report. `from_frame`, `to_frame` and `to_xarray` are the
 way in and out, `plots` draws filters and data, `save_state` and `load_state` keep a filter.
+`adapters` takes filters over from FilterPy, pykalman and dynamax.
 """
 
-from ewif_jax.lab import plots
+from ewif_jax.lab import adapters, plots
 from ewif_jax.lab.arrays import to_frame, to_xarray
 from ewif_jax.lab.compare import compare
 from ewif_jax.lab.comparison import Comparison
@@ -21,6 +22,7 @@ __all__ = [
     "Limits",
     "Method",
     "Tuning",
+    "adapters",
     "axis",
     "compare",
     "from_frame",
