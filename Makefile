@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STUDY := $(VENV)/.study
 DEV := $(VENV)/.dev
+SITE := $(VENV)/.site
 # PYTHON given by hand is what runs: it is looked for in pyenv's versions too, and an environment of
 # another version is made again.
 ifeq ($(origin PYTHON), command line)
@@ -26,7 +27,7 @@ QUARTER := tests/oracles tests/test_architecture.py tests/test_checks.py tests/t
    tests/papers/test_anderson.py
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all test-newest test-quarter lint types check bench reproduce clean
+.PHONY: demo test test-all test-newest test-quarter lint types check site docs bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
@@ -52,6 +53,13 @@ types: $(DEV)
 
 check: lint types test
 
+site: $(SITE)  ## the pages, in build/site; a warning is an error
+	$(BIN)/python docs/site/build.py
+
+docs: site $(DEV)  ## the same, and everything on them is run: notebooks, blocks, guides
+	$(BIN)/python -m pytest --all tests/test_site.py tests/test_readme.py tests/test_guides.py \
+	   tests/lab/test_guide.py tests/test_notebooks.py
+
 reproduce: $(STUDY)  ## every published experiment at full size
 	$(BIN)/ewif-jax study all --overwrite
 
@@ -70,6 +78,10 @@ $(STUDY): $(BIN)/python pyproject.toml
 $(DEV): $(BIN)/python pyproject.toml
 	$(PIP) -e ".[dev]"
 	touch $@ $(STUDY)
+
+$(SITE): $(BIN)/python pyproject.toml
+	$(PIP) -e ".[site]"
+	touch $@
 
 clean:
 	rm -rf .venv .venv-newest build dist results
