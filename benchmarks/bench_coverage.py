@@ -16,31 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import ewif_jax as ej
-from ewif_jax.tuning.quasi_newton import quasi_newton
+from ewif_jax.study.shared.fits import fitted
 
 OUTPUT = Path(__file__).parent / "results" / "coverage.json"
-ROWS, LATE, AT_ONCE = 120, 0.3, 250
+ROWS, LATE = 120, 0.3
 Q, R = 0.5, 1.0
-
-
-def maximised(loss: Any, start: np.ndarray, data: Any) -> np.ndarray:
-    """Where loss(x (n,), data set) is least, (D, n): the descents of `tune`, side by side."""
-    priced = jax.jit(jax.vmap(jax.value_and_grad(loss)))
-    count, size = len(jax.tree.leaves(data)[0]), len(start)
-    none = np.zeros(size, bool)
-    searches = [quasi_newton(start, np.ones(size), none, 1e-12) for _ in range(count)]
-    points = np.stack([next(search) for search in searches])
-    best, least, open_ = points.copy(), np.full(count, np.inf), set(range(count))
-    while open_:
-        values, slopes = map(np.asarray, priced(jnp.asarray(points), data))
-        for k in list(open_):
-            if values[k] < least[k]:
-                best[k], least[k] = points[k], values[k]
-            try:
-                points[k] = searches[k].send((float(values[k]), slopes[k]))
-            except StopIteration:
-                open_.discard(k)
-    return best
 
 
 def told(name: str, inside: np.ndarray, extra: dict[str, Any]) -> dict[str, Any]:
@@ -77,12 +57,7 @@ def of_variances(count: int, seed: int) -> list[dict[str, Any]]:
         params = {"q": jnp.exp(x[0]), "r": jnp.exp(x[1])}
         return -ej.log_likelihood(estimator, params, stream(own), **setting) / ROWS
 
-    found = np.concatenate(
-        [
-            maximised(loss, np.log([1.0, 1.0]), jnp.asarray(value[k : k + AT_ONCE]))
-            for k in range(0, count, AT_ONCE)
-        ]
-    )
+    found = fitted(loss, np.log([1.0, 1.0]), value).point
     inside, seconds = [], []
     for x, own in zip(found, value, strict=True):
         begun = time.perf_counter()
@@ -124,12 +99,7 @@ def of_tau(count: int, runs: int, many: int, seed: int) -> list[dict[str, Any]]:
         total = ej.log_likelihood(estimator, {"tau": jnp.exp(x[0])}, stream(own), **setting)
         return -total / (runs * len(time_))
 
-    found = np.concatenate(
-        [
-            maximised(loss_of, np.log([best]), jnp.asarray(value[k : k + 50]))
-            for k in range(0, count, 50)
-        ]
-    )
+    found = fitted(loss_of, np.log([best]), value, at_once=50).point
     inside, seconds = [], []
     for x, own in zip(found, value, strict=True):
         begun = time.perf_counter()

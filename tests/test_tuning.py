@@ -51,7 +51,10 @@ ESTIMATORS = {
 }
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+EWIF_OR_ALL = ["ewif", pytest.param("al1", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("name", EWIF_OR_ALL)
 def test_gradients_of_all_losses_are_finite_differences(name):
     estimator, names = ESTIMATORS[name]
     every = losses(estimator)
@@ -82,7 +85,7 @@ def test_gradients_of_all_losses_are_finite_differences(name):
     assert np.all(np.abs(forward) > 1e-6), "a loss that does not depend on its parameters"
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", EWIF_OR_ALL)
 def test_gradients_are_finite_in_float32(name):
     estimator, names = ESTIMATORS[name]
     every = losses(estimator, np.float32)

@@ -18,6 +18,7 @@ from ewif_jax.scenarios.divergence import divergence, divergence_curve, divergen
 from ewif_jax.scenarios.mixed_fleet import mixed_fleet, mixed_fleet_model
 from ewif_jax.scenarios.random_walk import random_walk, random_walk_model
 from ewif_jax.scenarios.sine import sine, sine_model, sine_signal
+from ewif_jax.scenarios.three_clocks import three_clocks, three_clocks_model
 from ewif_jax.scenarios.turn import turn, turn_model, turn_state
 from ewif_jax.scenarios.two_bearings import two_bearings, two_bearings_model, two_bearings_path
 
@@ -42,6 +43,8 @@ __all__ = [
     "sine",
     "sine_model",
     "sine_signal",
+    "three_clocks",
+    "three_clocks_model",
     "turn",
     "turn_model",
     "turn_state",

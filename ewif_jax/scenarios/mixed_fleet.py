@@ -9,6 +9,7 @@ from ewif_jax import checks, models
 from ewif_jax.models import Model
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.recipe import from_recipe
+from ewif_jax.scenarios.paths import drawn_path
 from ewif_jax.types import Gaussian, Measurement, Parameter
 
 RADAR, CAMERA, RECEIVER = 0, 1, 2
@@ -70,7 +71,7 @@ def mixed_fleet(outliers: float = 0.05, latency: float = CAMERA_LATENCY) -> Scen
         waited = jax.random.uniform(wait, time.shape, minval=2.0, maxval=5.0)
         arrival = time + jnp.where(sensor == RECEIVER, waited, delay)
         first = jnp.asarray(START) + jnp.asarray(START_SD) * jax.random.normal(begin, (4,))
-        path = _path(model, moves, first, jnp.concatenate([jnp.asarray(time), arrival]))
+        path = drawn_path(model, moves, first, jnp.concatenate([jnp.asarray(time), arrival]))
         seen, shown = path[: time.size], path[time.size :, :2]
         exact = jax.vmap(model.observe, (None, 0, 0, 0))(None, seen, sensor, time)
         is_outlier = jax.random.bernoulli(chance, outliers, time.shape)
@@ -87,22 +88,3 @@ def mixed_fleet(outliers: float = 0.05, latency: float = CAMERA_LATENCY) -> Scen
 
     prior = Gaussian(jnp.asarray(START), jnp.diag(jnp.square(jnp.asarray(START_SD))))
     return Scenario(simulate, prior, 0.0)
-
-
-def _path(model: Model, key: Array, first: Array, times: Array) -> Array:
-    """The state (T, 4) at `times` (T,), in any order, of a target that is at `first` at time 0."""
-    order = jnp.argsort(times)
-    steps = jnp.diff(times[order], prepend=0.0)
-    shocks = jax.random.normal(key, (times.size, 4))
-
-    def move(state: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-        step, shock = given
-        none = jnp.zeros_like(step)
-        cov = model.process_cov(None, none, step)
-        # The covariance of no time is zero, which has a root, but no Cholesky factor.
-        root = jnp.linalg.cholesky(cov + jnp.where(step > 0, 0.0, 1.0) * jnp.eye(4))
-        state = model.transition(None, state, none, step) + jnp.where(step > 0, root @ shock, 0.0)
-        return state, state
-
-    _, states = jax.lax.scan(move, first, (steps, shocks))
-    return jnp.zeros_like(states).at[order].set(states)

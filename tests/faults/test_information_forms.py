@@ -75,7 +75,7 @@ def test_information_after_a_gap_of_stable_motion_is_kalman(dtype, gap):
     np.testing.assert_allclose(ewif.mean[5:], fresh.mean, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_the_gradient_in_tau_is_finite_for_every_gap(dtype):
     filt = ej.ewif(walk(1.0), tau=lambda p: p)
     value = jnp.asarray([0.0, 1.1, 1.9, 3.05, 50.0, 51.2, 51.9, 53.1], dtype)

@@ -47,7 +47,7 @@ def slope_by_hand(F, Q, cov, at, name):
     return sum(w * loss_by_hand(F, Q, cov, **p) for w, p in zip(weights, moved, strict=True)) / step
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float64, marks=pytest.mark.slow), np.float32])
 @pytest.mark.parametrize("name", MODELS)
 def test_square_root_and_kalman(name, dtype):
     model, F, Q = MODELS[name]

@@ -200,7 +200,7 @@ def test_otherwise_the_order_matters_to_second_order():
     assert 0.3 < apart("sigma-points", 0.0) < 0.4
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["extended", pytest.param("sigma-points", marks=pytest.mark.slow)])
 def test_batches_are_runs_and_gradients_are_quotients(kind):
     streams = [stream(), stream(0.3, order=IN_ORDER)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *streams)

@@ -211,7 +211,7 @@ def test_outliers_open_it_as_rarely_as_stated():
     assert not passed[:, :patience].any()
 
 
-@pytest.mark.parametrize("name", ["asd", "ewif"])
+@pytest.mark.parametrize("name", ["asd", pytest.param("ewif", marks=pytest.mark.slow)])
 def test_gradients_are_finite_differences(name):
     model = ej.models.constant_velocity(
         sensors=ej.models.position_sensor(lambda p: p["r"]), q=lambda p: p["q"]

@@ -136,7 +136,9 @@ def test_late_data_through_replay_and_drop_late():
     assert (status[:, 3] == ej.Status.TOO_LATE).all()
 
 
-@pytest.mark.parametrize(("dtype", "q"), [(np.float32, 0.5), (np.float64, 0.0)])
+@pytest.mark.parametrize(
+    ("dtype", "q"), [(np.float32, 0.5), pytest.param(np.float64, 0.0, marks=pytest.mark.slow)]
+)
 def test_gradients_are_finite(dtype, q):
     """Without process noise too, which makes it the bootstrap filter."""
     filtered = ej.guided(BEARINGS, 50)

@@ -77,7 +77,7 @@ def test_each_run_of_a_batch_has_its_own_latency(name):
         same(jax.tree.map(lambda x, run=run: x[run], got), single, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["ewif", "asd", "replay"])
+@pytest.mark.parametrize("name", ["ewif", "asd", pytest.param("replay", marks=pytest.mark.slow)])
 def test_slopes_are_finite_differences(name):
     """Away from the places where two measurements change their order."""
     estimator = ESTIMATORS[name]
@@ -109,6 +109,7 @@ def test_an_exact_method_has_a_kink_where_the_order_changes_and_drop_late_a_jump
     assert jumps["drop_late"] > 1e-3
 
 
+@pytest.mark.slow
 def test_tuning_recovers_a_latency():
     rng = np.random.default_rng(11)
     steps, late, runs = 40, 0.3, 20

@@ -33,10 +33,17 @@ FILES = {
     "arrowhead-ekf": {"fig10.png"},
     "arbitrary-target": {"fig2.png", "animation.gif", "smoothers.csv"},
     "tuning-under-delay": {"landscape.png", "descent.png"},
+    "latency": {"landscape.png", "estimates.png", "grid.csv", "position.csv"},
+    "manoeuvres": {"errors.png", "modes.png"},
 }
 
 
-@pytest.mark.parametrize("name", FILES)
+LONG = ("random-walk", "tuning-under-delay", "latency", "manoeuvres")
+"""Whose parts are tested one by one too; whole with --all."""
+EVERY = [pytest.param(x, marks=pytest.mark.slow if x in LONG else ()) for x in FILES]
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_study_runs_end_to_end(name, tmp_path, capsys):
     assert run(["study", name, "--quick", "--runs", "2", "--out", str(tmp_path)]) == 0
     assert "±" in capsys.readouterr().out

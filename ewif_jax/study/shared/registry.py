@@ -30,6 +30,8 @@ STUDIES = (
     Study("arrowhead-ekf", "the same with an extended filter"),
     Study("arbitrary-target", "two sensors, one late: filter and smoother, animated"),
     Study("tuning-under-delay", "tau, q and the cut-off by gradient through late measurements"),
+    Study("latency", "clocks that are off, calibrated from the data alone"),
+    Study("manoeuvres", "EWIF, Kalman filter and interacting models on targets seen late"),
     Study("two-bearings", "two rotating bearing sensors, one late: ensembles and particles"),
     Study("turn", "particle filters, a fast turn and a late sensor"),
     Study("divergence", "data saturation, and what weighting does about it"),

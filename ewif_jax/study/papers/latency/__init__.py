@@ -1,0 +1,1 @@
+"""Clocks that are off, calibrated from the measurements alone."""
