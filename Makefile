@@ -27,7 +27,7 @@ QUARTER := tests/oracles tests/test_architecture.py tests/test_checks.py tests/t
    tests/papers/test_anderson.py
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all test-newest test-quarter lint types check site docs bench reproduce clean
+.PHONY: demo test test-all test-newest test-oldest test-versions test-quarter dist lint types check site docs bench reproduce clean
 
 demo: $(STUDY)  ## the sine experiment: filtered, tuned by gradient, drawn
 	$(BIN)/ewif-jax study sine --overwrite
@@ -40,6 +40,25 @@ test-all: $(DEV)  ## the slow ones too
 
 test-newest:  ## all tests on the newest Python here, with the newest JAX, in .venv-newest
 	newest=$$($(PYTHON) .ci/interpreter.py newest) && $(MAKE) test VENV=.venv-newest PYTHON="$$newest"
+
+test-oldest:  ## a quarter of them with the oldest package versions allowed, in .venv-oldest
+	mkdir -p build
+	$(PYTHON) .ci/oldest.py lab study > build/oldest.txt
+	PIP_CONSTRAINT=$(abspath build/oldest.txt) $(MAKE) test-quarter VENV=.venv-oldest
+
+test-versions:  ## a quarter of them on every Python here from 3.11 on, with the newest packages
+	for name in python3.11 python3.12 python3.13; do \
+	  found=$$($(PYTHON) .ci/interpreter.py $$name); \
+	  if [ -z "$$found" ]; then echo "There is no $$name here: not run."; continue; fi; \
+	  $(MAKE) test-quarter VENV=.venv-$$name PYTHON="$$found" || exit 1; \
+	done
+
+dist: $(DEV)  ## wheel and source in dist/, checked, and the wheel alone in an environment of its own
+	$(PIP) -e ".[release]"
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python .ci/wheel.py dist
 
 test-quarter: $(DEV)
 	$(PYTEST) $(QUARTER)
@@ -84,4 +103,4 @@ $(SITE): $(BIN)/python pyproject.toml
 	touch $@
 
 clean:
-	rm -rf .venv .venv-newest build dist results
+	rm -rf .venv .venv-* build dist results

@@ -15,6 +15,7 @@ from ewif_jax.study.papers.manoeuvres import runs as runs_of
 from ewif_jax.study.papers.manoeuvres.runs import KALMAN, Manoeuvre
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
+from ewif_jax.study.shared.one_by_one import per_run
 
 SETTLED = 5.0
 """seconds from the start that do not count"""
@@ -60,7 +61,8 @@ def run(experiment: Experiment) -> None:
 
 def _chosen(experiment: Experiment, manoeuvre: Manoeuvre, late: bool, number: int) -> Arrays:
     runs = 2 if experiment.options.quick else 16
-    batch = simulate_batch(manoeuvre.scenario, jax.random.split(experiment.key(10 + number), runs))
+    keys = jax.random.split(experiment.key(10 + number), runs)
+    batch = per_run(simulate_batch(manoeuvre.scenario, keys))
     with experiment.timed("settings"), experiment.progress("settings") as report:
         return runs_of.chosen_settings(manoeuvre, late, batch, report)
 
