@@ -28,8 +28,8 @@ LOOK = {
     "PFoosmPS": ("#7b3294", "--"),
     "exact replay": (TRUTH, "-"),
 }
-GIVEN_UP = {"EKF": ("#f4a582", ":"), "UKF": ("#92c5de", ":")}
-"""which the paper did not run to the end"""
+BESIDE = {"EKF": ("#f4a582", ":"), "UKF": ("#92c5de", ":"), "EWIF": ("#66bd63", "-.")}
+"""which the paper did not run to the end, or not at all"""
 UNITS = {"position": "m", "velocity": "m/s"}
 
 
@@ -56,7 +56,7 @@ def rms_panel(
     """Figs. 3 and 4: RMS error against time, with bounds."""
     figure, axes = study_canvas(width=11, height=5.5)
     time = np.arange(31.0)
-    for name, (color, style) in (LOOK | GIVEN_UP).items():
+    for name, (color, style) in (LOOK | BESIDE).items():
         if len(found[name][kind]) < len(found["PFstd"][kind]) and len(found[name][kind]) < 100:
             continue  # too few runs for a curve of its own
         mean = found[name][kind].mean(0)

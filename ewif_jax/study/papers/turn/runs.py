@@ -10,6 +10,7 @@ import numpy as np
 
 from ewif_jax.analysis.pcrlb import pcrlb_late
 from ewif_jax.estimators.bootstrap import bootstrap
+from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.unscented import unscented
 from ewif_jax.monte_carlo import Simulation, simulate_batch
@@ -25,7 +26,9 @@ from ewif_jax.types import Estimator, Numbers, RandomKey, Status, Trace
 LAG, BUFFER = 5, 12
 STD, ORD, EXT, EXACT = "PFstd", "PFord", "PFoosmEXT", "exact replay"
 EKS, UKS, PS = "PFoosmEKS", "PFoosmUKS", "PFoosmPS"
-EKF, UKF = "EKF", "UKF"
+EKF, UKF, EWIF = "EKF", "UKF", "EWIF"
+TAU = 4.0
+"""s; of the EWIF: the best of 0.5, 1, 2, ... 32, 100 s on 200 other runs"""
 TIMES = np.arange(SECONDS + 1.0)
 PRINTED = {"ut_alpha": 1e-3, "ut_beta": 2.0, "ut_kappa": 0.0}
 """sigma points of the paper"""
@@ -41,9 +44,9 @@ class TurnMethod(NamedTuple):
 
 
 def turn_methods(particles: int = 10_000) -> dict[str, TurnMethod]:
-    """The six filters of the paper, the exact answer of the particle filter, and the two filters
-    that the paper gave up. Its sigma points need float64; in float32 those of the cubature rule
-    take their place."""
+    """The six filters of the paper, the exact answer of the particle filter, the two filters that
+    the paper gave up, and the EWIF with lines through sigma points. The paper's sigma points need
+    float64; in float32 those of the cubature rule take their place."""
     model = turn_model()
     in_sequence = bootstrap(model, particles)
     points: dict[str, Any] = PRINTED if _as_printed() else {}
@@ -61,6 +64,7 @@ def turn_methods(particles: int = 10_000) -> dict[str, TurnMethod]:
         EXACT: TurnMethod(replay(in_sequence, BUFFER, width=2), share=0.1),
         EKF: TurnMethod(extended(model)),
         UKF: TurnMethod(unscented(model, **points)),
+        EWIF: TurnMethod(ewif(model, TAU, linearisation="sigma-points")),
     }
 
 

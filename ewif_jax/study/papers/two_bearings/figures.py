@@ -31,6 +31,7 @@ LOOK = {
     "PF, half as many": ("#999999", "-."),
     "EKF, late dropped": ("#fdb863", "--"),
     "EKF, exact replay": (TRUTH, "-"),
+    "EWIF": ("#66bd63", "-."),
 }
 SHOWN = ("EKF (Al1)", "RTS-based", "EnKF1", "EnKF2", "EnKF2, shared noise", "PF")
 Found = Mapping[str, Mapping[str, np.ndarray]]
