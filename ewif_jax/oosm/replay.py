@@ -133,7 +133,7 @@ def replay(estimator: Estimator, lag: int, *, width: int = 8) -> Estimator:
         "replay", start, move, measure, estimate, is_after_base, model=estimator.model
     )
     # What it wraps checks the prior and the key, and may predict earlier times.
-    method = method._replace(moves_back=True, starts_from_nothing=True)
+    method = method._replace(moves_back=True, starts_from_nothing=True, remembers=True)
     return estimator_from(method._replace(model=estimator.model))
 
 

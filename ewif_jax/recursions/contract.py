@@ -94,6 +94,7 @@ class Recursion(NamedTuple):
     keeps: bool = False
     estimated: tuple[str, ...] = ("mean", "cov")
     model: Model | None = None
+    remembers: bool = False
 
 
 def estimator_from(recursion: Recursion) -> Estimator:
@@ -137,7 +138,7 @@ def estimator_from(recursion: Recursion) -> Estimator:
         if recursion.starts_from_nothing:
             is_broken &= ~accepted
         likelihood = jnp.where(is_broken, -jnp.inf, likelihood)
-        accepted, changed = accepted & ~is_broken, accepted | is_broken
+        accepted, changed = accepted & ~is_broken, accepted | is_broken | recursion.remembers
         used = jnp.where(late, Status.LATE_USED, Status.USED)
         status = jnp.where(accepted, used, Status.REJECTED)
         status = jnp.where(present, status, Status.MASKED).astype(jnp.int32)

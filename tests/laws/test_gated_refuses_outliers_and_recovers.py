@@ -152,6 +152,24 @@ def test_a_replay_of_a_gate_is_the_gate_in_order():
     assert list(late.info.status[BAD]) == [REJECTED, REJECTED]
 
 
+def test_a_replay_of_a_gate_opens_when_the_gate_does():
+    """What was refused is remembered: a jump of the target locks neither of them out."""
+    far = np.where(np.arange(24) >= 10, 50.0, 0.0)[:, None]
+    data = ej.stream(np.arange(1.0, 25.0), far)
+    model = ej.models.random_walk(q=0.01, sensors=ej.models.position_sensor(1.0))
+    gate = ej.gated(ej.kalman(model), LEVEL, 3)
+    prior = ej.Gaussian(np.zeros(1), np.eye(1))
+    found, wanted = (
+        ej.run(method, None, data, prior=prior, t0=0.0) for method in (ej.replay(gate, 4), gate)
+    )
+    np.testing.assert_array_equal(found.info.status, wanted.info.status)
+    np.testing.assert_allclose(found.mean, wanted.mean, rtol=1e-12)
+    assert list(wanted.info.status[10:14]) == [REJECTED] * 3 + [USED]
+    never = ej.run(ej.replay(ej.gated(ej.kalman(model), LEVEL, None), 4), None, data,
+                   prior=prior, t0=0.0)  # fmt: skip
+    assert (never.info.status[10:] == REJECTED).all()
+
+
 @pytest.mark.parametrize("name", ["ewif", "al1"])
 def test_a_lock_out_by_late_data_ends(name):
     """Everything comes late, and from row 6 on elsewhere."""
