@@ -1,0 +1,1 @@
+"""An open benchmark of methods for late measurements: ``python -m benchmarks.oosm --help``."""
