@@ -13,6 +13,7 @@ from ewif_jax.estimators.ewif import ewif
 from ewif_jax.estimators.extended import extended
 from ewif_jax.estimators.imm import imm, imm_probabilities
 from ewif_jax.estimators.kalman import kalman
+from ewif_jax.live import arrivals, step
 from ewif_jax.models import Model, constant_velocity, position_sensor
 from ewif_jax.monte_carlo import Scenario, Simulation
 from ewif_jax.oosm.drop_late import drop_late
@@ -21,7 +22,7 @@ from ewif_jax.scenarios.arrowhead import arrowhead, arrowhead_path
 from ewif_jax.scenarios.turn import turn, turn_model
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.late import sweep
-from ewif_jax.types import Estimator, Gaussian, Numbers, Parameter, Params, RandomKey
+from ewif_jax.types import Estimator, Gaussian, Measurement, Numbers, Parameter, Params, RandomKey
 
 KALMAN, EWIF, IMM = "Kalman", "EWIF", "IMM"
 VARIANCE = 2000.0
@@ -56,8 +57,9 @@ def changing(params: Params, t0: Numbers, t1: Numbers) -> Array:
 def arrowhead_manoeuvre(steps: int) -> Manoeuvre:
     """The arrowhead with a velocity in the state: constant but for noise."""
     scenario = arrowhead(r=VARIANCE, steps=steps)
-    start = np.concatenate([np.asarray(arrowhead_path(0.0)), np.zeros(2)])
-    prior = Gaussian(start, np.diag([1.0, 1.0, 25.0, 25.0]))
+    start: Any = np.concatenate([np.asarray(arrowhead_path(0.0)), np.zeros(2)])
+    spread: Any = np.diag([1.0, 1.0, 25.0, 25.0])
+    prior = Gaussian(start, spread)
 
     def moving(q: Parameter) -> Model:
         return constant_velocity(sensors=position_sensor(VARIANCE, dims=2), q=q, dims=2)
@@ -134,21 +136,24 @@ def example_modes(manoeuvre: Manoeuvre, chosen: Arrays, key: RandomKey) -> Array
     tracks = {}
     for name in manoeuvre.filters:
         late, params = with_late_data(manoeuvre, name, True), params_of(chosen, name)
-        record = _busy if name == IMM else None
-        trace = run_filter(
-            late, params, run.measurements, prior=manoeuvre.prior, t0=0.0, record=record
-        )
+        trace = run_filter(late, params, run.measurements, prior=manoeuvre.prior, t0=0.0)
         tracks[name] = np.asarray(trace.mean[:, :2])
         if name == IMM:
-            tracks["busy"] = np.asarray(trace.recorded)
+            tracks["busy"] = _busy(late, params, run.measurements, manoeuvre.prior)
     time = np.maximum.accumulate(np.asarray(run.measurements.time))
     truth, seen = np.asarray(run.truth), np.asarray(run.measurements.value)
     return {"time": time, "truth": truth, "seen": seen, **tracks}
 
 
-def _busy(params: Params, state: Any) -> Array:
-    del params
-    return imm_probabilities(state.current)[1]
+def _busy(late: Estimator, params: Params, stream: Measurement, prior: Gaussian) -> np.ndarray:
+    """The probability (T,) of the busy mode after each arrival."""
+    dtype = jnp.asarray(stream.value).dtype
+    given = Gaussian(jnp.asarray(prior.mean, dtype), jnp.asarray(prior.cov, dtype))
+    state, found = late.init(params, given, jnp.zeros((), dtype)), []
+    for arrival in arrivals(stream):
+        state, _ = step(late, params, state, arrival)
+        found.append(float(imm_probabilities(state.current)[1]))
+    return np.asarray(found)
 
 
 def path_acceleration(time: np.ndarray) -> np.ndarray:

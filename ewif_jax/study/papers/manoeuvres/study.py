@@ -92,6 +92,7 @@ def _compared(
 
 def _method_rows(world: str, use: str, found: Comparison, chosen: Arrays) -> list[dict[str, Any]]:
     table, rows = found.table(reference=KALMAN).set_index("method"), []
+    row: Any
     for name, row in table.iterrows():
         params = runs_of.params_of(chosen, str(name))
         against = Measured(row["difference"], row["difference_error"])
