@@ -127,7 +127,8 @@ def test_the_examples_of_tuning_find_what_they_say():
     assert abs(latency - 0.4) < 3 * errors["latency"]
 
 
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("ewif_jax/**/*.md")])
+FOLDERS = ("benchmarks", "docs", "ewif_jax", "notebooks")
+PAGES = sorted([*ROOT.glob("*.md"), *(page for x in FOLDERS for page in ROOT.glob(f"{x}/**/*.md"))])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -11,7 +11,7 @@ import ewif_jax as ej
 
 DOCS = Path(__file__).parents[1] / "docs"
 # The first asks for settings that have to come before anything is computed.
-PAGES = ("performance", "index", "quickstart")
+PAGES = ("prepare-cpu", "performance", "index", "quickstart")
 ROOMS = ("analysis", "continuous", "lab", "losses", "models", "scenarios")
 DOCUMENTED = re.compile(r"^::: ewif_jax\.([\w.]+)$", re.MULTILINE)
 
@@ -34,7 +34,7 @@ def printed() -> list[tuple[str, str]]:
 
 def test_a_line_of_a_page_prints_what_it_says():
     pairs = apart(printed, double=False)
-    assert len(pairs) == 7
+    assert len(pairs) == 8
     for said, found in pairs:
         assert found == said
 

@@ -21,6 +21,7 @@ ELSEWHERE = {
     "CONTRIBUTING.md": "contributing.md",
     "benchmarks/README.md": "benchmarks.md",
     "ewif_jax/fast/README.md": "fast.md",
+    "notebooks/README.md": "notebooks/index.md",
 }
 """Pages that do not lie in `docs/`: where they are on the site."""
 LANGUAGES = {".py": "python", ".toml": "toml", ".cff": "yaml"}
