@@ -19,6 +19,7 @@ OUT = ROOT / "build" / "pages"
 ELSEWHERE = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
     "ewif_jax/fast/README.md": "fast.md",
     "notebooks/README.md": "notebooks/index.md",
