@@ -1,6 +1,7 @@
 """Interacting multiple models: one filter for each way in which a target may move."""
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ from ewif_jax.recursions.mixtures import (
     mixed_moments,
     normalised_weights,
     passed_on,
+    together,
 )
 from ewif_jax.recursions.modes import (
     chain_of,
@@ -156,16 +158,19 @@ def imm(
     ) -> tuple[ModesState, Info]:
         pairs = zip(estimators, state.members, strict=True)
         members, infos = zip(*(e.update(params, s, measurement) for e, s in pairs), strict=True)
-        info = jax.tree.map(lambda *x: jnp.stack(x), *infos)
-        is_awake = info.status == Status.USED
+        every_awake = [info.status == Status.USED for info in infos]
+        is_awake = together(*(x.astype(state.time.dtype) for x in every_awake)) > 0
         before = jnp.where(is_awake, state.log_probabilities, -jnp.inf)
-        joint = before + jnp.where(is_awake, info.log_likelihood, 0)
+        told = together(*(info.log_likelihood for info in infos))
+        joint = before + jnp.where(is_awake, told, 0)
         total = log_sum(joint)
         # What no model makes a number of, or all find impossible, teaches nothing about them.
         teaches = jnp.isfinite(total)
         after = jnp.where(teaches, joint - jnp.where(teaches, total, 0), state.log_probabilities)
-        status = jnp.where(jnp.any(is_awake), Status.USED, Status.REJECTED).astype(jnp.int32)
-        shown = _mixed_innovation(model, measurement, normalised_weights(before), info)
+        any_awake = reduce(jnp.logical_or, every_awake)
+        status = jnp.where(any_awake, Status.USED, Status.REJECTED).astype(jnp.int32)
+        shares = jnp.exp(normalised_weights(before))
+        shown = _mixed_innovation(model, measurement, shares, is_awake, any_awake, infos)
         shown = shown._replace(log_likelihood=total, status=status)
         return ModesState(state.time, members, after), shown
 
@@ -175,7 +180,8 @@ def imm(
         return Gaussian(*mixed_moments(shares, jnp.ones(count, bool), *found, angle))
 
     recursion = Recursion("imm", start, move, measure, estimate, model=model)
-    return estimator_from(recursion._replace(moves_back=True))
+    # Members keep what they do not use, and then nothing here is learnt.
+    return estimator_from(recursion._replace(moves_back=True, keeps=True))
 
 
 def _mixed_members(
@@ -201,25 +207,31 @@ def _mixed_members(
 
 
 def _mixed_innovation(
-    model: Model | None, measurement: Measurement, log_weights: Array, info: Info
+    model: Model | None,
+    measurement: Measurement,
+    shares: Array,
+    is_awake: Array,
+    any_awake: Array,
+    infos: Sequence[Info],
 ) -> Info:
-    """`Info` with the moments of the innovation of all models that predict one; of the members'
-    `info`, every leaf of which leads with M."""
-    values, sensor, mask = info.innovation, measurement.sensor, measurement.mask
-    is_awake = info.status == Status.USED
+    """`Info` with the moments of the innovation of all models that predict one, with `shares` (M,)
+    of those that do, `is_awake` (M,)."""
+    sensor, mask = measurement.sensor, measurement.mask
 
     def apart(x: Array, y: Array) -> Array:
         return x - y if model is None else model.residual(x, y, sensor)
 
     # Angles on both sides of a cut have a mean, counted from the first of them.
-    values = values[:1] + jax.vmap(lambda x: apart(x, values[0]))(values)
-    mean, cov = mixed_moments(jnp.exp(log_weights), is_awake, values, info.innovation_cov)
+    first = infos[0].innovation
+    values = together(*(first + apart(info.innovation, first) for info in infos))
+    covs = together(*(info.innovation_cov for info in infos))
+    mean, cov = mixed_moments(shares, is_awake, values, covs)
     mean = apart(mean, jnp.zeros_like(mean))
-    seen = mask & jnp.any(is_awake)
+    seen = mask & any_awake
     # Parameters that make no covariances say so by NaN, in whichever model.
-    is_broken = ~jnp.all(jnp.isfinite(info.innovation_cov))
+    is_broken = ~jnp.all(jnp.isfinite(covs))
     cov = jnp.where(is_broken, jnp.nan, gaussian.mask_cov(cov, seen))
-    return Info(jnp.where(seen, mean, 0), cov, *(x[0] for x in info[2:]))
+    return infos[0]._replace(innovation=jnp.where(seen, mean, 0), innovation_cov=cov)
 
 
 def _estimates(
@@ -228,7 +240,7 @@ def _estimates(
     """Means (M, n) and covariances (M, n, n) of the members."""
     pairs = zip(estimators, state.members, strict=True)
     found = [e.estimate(params, own) for e, own in pairs]
-    return jnp.stack([x.mean for x in found]), jnp.stack([x.cov for x in found])
+    return together(*(x.mean for x in found)), together(*(x.cov for x in found))
 
 
 def imm_probabilities(state: ModesState) -> Array:

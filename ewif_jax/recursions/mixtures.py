@@ -1,29 +1,45 @@
-"""Mixtures of estimates: weights in logarithms, and the moments of all together."""
+"""Mixtures of estimates: weights in logarithms, and the moments of all together.
+
+The members are the first axis, which is short: kernels, so that in a batch a sum over them is a sum
+of long vectors.
+"""
 
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ewif_jax.fast.batched import kernel, stacked
 from ewif_jax.models.angles import Angles, centre_of, wrapped_state
 
 FARTHEST = 80.0
 """What a logarithm may be above the one that counts: its exponential is still a number."""
 
 
-def log_sum(x: Array) -> Array:
-    """log sum exp of numbers of which some may be -inf; -inf of nothing, with derivative 0."""
-    highest = jnp.max(x)
+@kernel
+def together(*members: Array) -> Array:
+    """Arrays of floats, one of each member, along a new first axis."""
+    return stacked(members)
+
+
+def _log_sum(x: Array) -> Array:
+    highest = jnp.max(x, 0)
     level = jnp.where(jnp.isfinite(highest), highest, 0)
     level = lax.stop_gradient(level)
-    total = jnp.sum(
-        jnp.where(jnp.isfinite(x), jnp.exp(jnp.where(jnp.isfinite(x), x, 0) - level), 0)
-    )
+    finite = jnp.where(jnp.isfinite(x), x, 0)
+    total = jnp.sum(jnp.where(jnp.isfinite(x), jnp.exp(finite - level[None]), 0), 0)
     return jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1)) + level, -jnp.inf)
 
 
+@kernel
+def log_sum(x: Array) -> Array:
+    """log sum exp of numbers of which some may be -inf; -inf of nothing, with derivative 0."""
+    return _log_sum(x)
+
+
+@kernel
 def normalised_weights(log_weights: Array) -> Array:
     """Logarithms of weights whose sum is one (as they are, if all are zero)."""
-    total = log_sum(log_weights)
-    return log_weights - jnp.where(jnp.isfinite(total), total, 0)
+    total = _log_sum(log_weights)
+    return log_weights - jnp.where(jnp.isfinite(total), total, 0)[None]
 
 
 def log_of(weights: Array) -> Array:
@@ -32,6 +48,7 @@ def log_of(weights: Array) -> Array:
     return jnp.where(positive, jnp.log(jnp.where(positive, weights, 1)), -jnp.inf)
 
 
+@kernel
 def passed_on(log_weights: Array, chances: Array) -> tuple[Array, Array]:
     """Log weights (M,) after member i has gone over to j with `chances` (M, M)[i, j], and what
     share of j comes from i, (M, M)[i, j]; 0 of a j to which nothing goes."""
@@ -57,15 +74,20 @@ def mixed_moments(
     says which components are mixed on the circle."""
     means = jnp.where(is_awake[:, None], means, 0)
     covs = jnp.where(is_awake[:, None, None], covs, 0)
+    awake = is_awake.astype(weights.dtype)
     if angle is None:
-        mean = jnp.sum(weights[:, None] * means, 0)
-        apart = means - mean[None]
-    else:
-        centre = centre_of(angle, means.T, weights)
-        around = wrapped_state(angle, (means - centre[None]).T).T
-        shift = jnp.sum(weights[:, None] * around, 0)
-        mean, apart = centre + shift, around - shift[None]
-    apart = jnp.where(is_awake[:, None], apart, 0)
+        return _moments(weights, awake, means, covs)
+    centre = centre_of(angle, means.T, weights)
+    around = wrapped_state(angle, (means - centre[None]).T).T
+    shift, cov = _moments(weights, awake, around, covs)
+    return centre + shift, cov
+
+
+@kernel
+def _moments(weights: Array, awake: Array, means: Array, covs: Array) -> tuple[Array, Array]:
+    mean = jnp.sum(weights[:, None] * means, 0)
+    # By `awake` and not by the weight: the derivative in a weight of zero is not zero.
+    apart = jnp.where(awake[:, None] > 0, means - mean[None], 0)
     # The law of total covariance: means that disagree are uncertainty too.
     spread = covs + apart[:, :, None] * apart[:, None, :]
     return mean, jnp.sum(weights[:, None, None] * spread, 0)
