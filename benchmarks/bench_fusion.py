@@ -42,7 +42,7 @@ def moving(sensors, factor: float = 1.0) -> ej.Model:
     return ej.models.constant_velocity(sensors=sensors, q=lambda p: factor * p["q"], dims=2)
 
 
-def changing(params: ej.Params, t0: jax.Array, t1: jax.Array) -> jax.Array:
+def changing(params: object, t0: jax.Array, t1: jax.Array) -> jax.Array:
     """What modes become over an interval, to first order in its length."""
     return jnp.eye(2) + (t1 - t0) * RATES
 

@@ -49,7 +49,7 @@ class Sizes(NamedTuple):
     """Steps of a block."""
     longest_block: int = 100
     """Steps of a block of short steps."""
-    short_step: int = 1400
+    short_step: int = 1500
     """Numbers that a step computes of one run: fewer, and its loop over a group will be one
     function (a group of a hundred runs stays below `compiling.WHOLE_LOOPS_BELOW`)."""
     even_lines: float = 1.25
