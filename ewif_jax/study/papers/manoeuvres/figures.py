@@ -46,6 +46,7 @@ def modes(example: Mapping[str, np.ndarray]) -> Figure:
     axes[0].plot(time, example["busy"], color=OTHER, label="probability of the busy mode")
     turning.plot(time, runs_of.path_acceleration(time), color=TRUTH, linewidth=0.9)
     turning.set_ylabel("acceleration of the target [m/s²]")
+    axes[0].yaxis.label.set_color(OTHER)
     axes[0].set_ylim(0, 1)
     label(
         axes[0], "", "probability of the busy mode", "Arrowhead, a measurement 5 s late on average"

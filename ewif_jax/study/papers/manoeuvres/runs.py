@@ -88,7 +88,7 @@ def turn_manoeuvre() -> Manoeuvre:
 
     quiet = turning(lambda p: QUIET * p["q"], lambda p: QUIET * p["q_turn"])
     busy = turning(lambda p: p["q"], lambda p: p["q_turn"])
-    noise = {"q": np.geomspace(1, 100, 5), "q_turn": np.geomspace(1e-4, 1e-2, 5)}
+    noise = {"q": np.geomspace(10, 1000, 5), "q_turn": np.geomspace(1e-5, 1e-2, 4)}
     own = ewif(turn_model(), lambda p: p["tau"], linearisation="sigma-points")
     filters = {
         EWIF: (own, settings(tau=np.geomspace(2, 32, 16))),
