@@ -79,6 +79,8 @@ class Recursion(NamedTuple):
     keeps: a measurement of which nothing is present leaves the state as it is, to the last bit. A
         batch then pays nothing for measurements that are not used; otherwise the contract selects
         the old state for them, which costs a pass over it.
+    remembers: a measurement that it rejects changes its state, as that of a gate which counts
+        refusals.
     """
 
     name: str
