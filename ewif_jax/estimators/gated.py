@@ -120,11 +120,11 @@ def _is_outside(info: Info, mask: Array, level: Numbers) -> Array:
     innovation, cov = lax.stop_gradient((info.innovation, info.innovation_cov))
     distance = gaussian.squared_distance(innovation, cov)
     count = jnp.sum(mask)
-    known = checks.concrete_value(level)
-    if known is None:
+    fixed_level = checks.concrete_value(level)
+    if fixed_level is None:
         tail = gammaincc(count.astype(distance.dtype) / 2, distance / 2)
         return tail < 1 - lax.stop_gradient(level)
-    return distance > jnp.asarray(_quantiles(mask.shape[0], float(known)), distance.dtype)[count]
+    return distance > jnp.asarray(_quantiles(mask.shape[0], float(fixed_level)), distance.dtype)[count]
 
 
 def _quantiles(most: int, level: float) -> np.ndarray:

@@ -128,8 +128,8 @@ def from_dynamax(params: Any, *, dt: float = 1.0, u: Parameter = None) -> Adapte
     d = _vector("emissions.bias", _or_zeros(_attribute(emissions, "emissions", "bias"), m), (m,))
     B = None
     if u is not None:
-        B = _matrix("dynamics.input_weights", _attribute(dynamics, "dynamics", "input_weights"),
-                    (n, "k"))  # fmt: skip
+        driving = _attribute(dynamics, "dynamics", "input_weights")
+        B = _matrix("dynamics.input_weights", driving, (n, "k"))
         seen = _attribute(emissions, "emissions", "input_weights")
         none = seen is None or not np.any(seen)
         checks.require(none, "emissions.input_weights", "zeros where there is an input", seen)
@@ -199,8 +199,8 @@ def _matrix(argument: str, value: Any, shape: tuple[int | str, ...]) -> np.ndarr
     checks.require(not callable(value), argument, "a constant matrix", "a function")
     checks.require(value is not None, argument, f"a matrix of shape {shape}", None)
     found = checks.from_rows(argument, value)
-    known = [size for size in shape if isinstance(size, int)]
-    found = found.reshape(1, 1) if found.ndim == 0 and set(known) == {1} else found
+    given_sizes = {size for size in shape if isinstance(size, int)}
+    found = found.reshape(1, 1) if found.ndim == 0 and given_sizes == {1} else found
     varies = "(what varies in time is a function of (params, t0, t1) in linear_model)"
     constant = f"a constant matrix {varies}"
     checks.require(found.ndim != 3, argument, constant, f"shape {found.shape}")

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
-from ewif_jax.study.papers.latency.runs import NAMES, POINTS, TRUTH
+from ewif_jax.study.papers.latency.runs import NAMES, NORMAL_95, POINTS, ROWS, TRUTH
 from ewif_jax.study.shared.figures import EWIF, MEASURED, OTHER, label, study_canvas
 from ewif_jax.study.shared.figures import TRUTH as BLACK
 from ewif_jax.study.shared.folder import Arrays
@@ -15,7 +15,7 @@ def landscape(fits: Arrays, grid: Arrays) -> Figure:
     ends."""
     figure, axes = study_canvas(width=6.5, height=5.5)
     points = grid["points"].reshape(*POINTS, 3)
-    below = (grid["cost"][0] - fits["cost"][0]).reshape(POINTS).min(0) * 180
+    below = (grid["cost"][0] - fits["cost"][0]).reshape(POINTS).min(0) * ROWS
     first, second = points[0, :, 0, 1], points[0, 0, :, 2]
     levels = [0, 1, 3, 10, 30, 100, 300, 1000]
     shades = BoundaryNorm(levels, 256, extend="max")
@@ -24,7 +24,7 @@ def landscape(fits: Arrays, grid: Arrays) -> Figure:
     )
     figure.colorbar(filled, ax=axes, label="log likelihood below its maximum", spacing="uniform")
     axes.plot(*fits["point"][:, 1:].T, ".", color=BLACK, markersize=2.5, label="all runs")
-    spread = 1.959964 * fits["error"][0, 1:]
+    spread = NORMAL_95 * fits["error"][0, 1:]
     where = fits["point"][0, 1:]
     axes.errorbar(*where, spread[1], spread[0], fmt="o", color="red", label="this run, 95 %")
     axes.plot(*TRUTH[1:], "*", color="white", markeredgecolor=BLACK, markersize=15, label="truth")

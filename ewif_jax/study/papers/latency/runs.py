@@ -26,6 +26,10 @@ STEPS = (0.5, 0.05, 0.05)
 POINTS = (5, 13, 13)
 """of the grid around the truth: log q, and each latency in s"""
 AT_ONCE = 50
+ROWS = 180
+"""measurements of a run; a cost is a mean over them"""
+NORMAL_95 = 1.959964
+"""standard errors on either side of an interval of 95 %"""
 
 
 def latency_filter() -> Any:

@@ -10,14 +10,13 @@ from ewif_jax.monte_carlo import Simulation, simulate_batch
 from ewif_jax.scenarios.three_clocks import three_clocks
 from ewif_jax.study.papers.latency import figures
 from ewif_jax.study.papers.latency import runs as runs_of
-from ewif_jax.study.papers.latency.runs import NAMES, TRUTH
+from ewif_jax.study.papers.latency.runs import NAMES, NORMAL_95, ROWS, TRUTH
 from ewif_jax.study.shared.claims import share
 from ewif_jax.study.shared.experiment import Experiment, Measured
 from ewif_jax.study.shared.folder import Arrays
 from ewif_jax.study.shared.late import mean_of, paired, rmse_of
 from ewif_jax.study.shared.one_by_one import per_run
 
-NORMAL_95 = 1.959964
 UNITS = ("1", "s", "s")
 
 
@@ -131,10 +130,6 @@ def _grid_rows(fits: Arrays, grid: Arrays) -> list[dict[str, Any]]:
             strict=True,
         )
     ]
-
-
-ROWS = 180
-"""measurements of a run; a cost is a mean over them"""
 
 
 def _grid_note(grid: Arrays) -> str:
