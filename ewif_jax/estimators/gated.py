@@ -124,7 +124,8 @@ def _is_outside(info: Info, mask: Array, level: Numbers) -> Array:
     if fixed_level is None:
         tail = gammaincc(count.astype(distance.dtype) / 2, distance / 2)
         return tail < 1 - lax.stop_gradient(level)
-    return distance > jnp.asarray(_quantiles(mask.shape[0], float(fixed_level)), distance.dtype)[count]
+    quantiles = _quantiles(mask.shape[0], float(fixed_level))
+    return distance > jnp.asarray(quantiles, distance.dtype)[count]
 
 
 def _quantiles(most: int, level: float) -> np.ndarray:
